@@ -169,7 +169,7 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     assert answer.status == 0, answer.error
     folder = problem.parent / "both"
     runs = ["plain-seed0", "plain-seed1", "rcv-seed0", "rcv-seed1"]
-    assert names(folder) == ["compare.html", "compare.json", "compare.png", *runs]
+    assert names(folder) == ["compare.html", "compare.json", *runs]
     for run in runs:
         record = json.loads((folder / run / "run.json").read_text())
         assert f"{record['method']}-seed{record['seed']}" == run
@@ -188,7 +188,7 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     again = unrender("compare", Path("both", "plain-seed0"), Path("both", "rcv-seed1"))
     assert again.status == 0
     assert "PSNR" in again.out
-    assert names(problem.parent / "out" / "compare") == ["compare.html", "compare.json", "compare.png"]
+    assert names(problem.parent / "out" / "compare") == ["compare.html", "compare.json"]
     (folder / "plain-seed0" / "report.html").unlink(missing_ok=True)
     assert unrender("report", Path("both", "plain-seed0")).out.strip() == str(
         Path("both", "plain-seed0", "report.html")

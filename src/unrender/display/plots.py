@@ -103,11 +103,6 @@ class Chart:
     )
 
 
-def axis_format(axis: str) -> tuple[str, Callable[[float], str]]:
-    """Return the label of the axis "seconds" or "samples", and the formatter of its values."""
-    return ("Seconds", formatting.number) if axis == "seconds" else ("Samples (paths)", formatting.count)
-
-
 def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
     """Return a chart of the first six lines with a finite value; None without one.
 
@@ -116,7 +111,8 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
         lines: curves; values that are not finite leave a gap.
         axis: horizontal axis, "seconds" or "samples", from 0.
     """
-    x_label, format_value = axis_format(axis)
+    in_seconds = axis == "seconds"
+    x_label, format_value = ("Seconds", formatting.number) if in_seconds else ("Samples (paths)", formatting.count)
     shown = [line for line in lines if np.isfinite(line.y).any()]
     more, shown = max(0, len(shown) - len(COLOURS)), shown[: len(COLOURS)]
     if not shown:

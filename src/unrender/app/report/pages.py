@@ -1,4 +1,4 @@
-"""Pages: report.html of one run; compare.html, compare.png and compare.json of several runs at equal time."""
+"""Pages: report.html of one run; compare.html and compare.json of several runs at equal time."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
 
     Args:
         directories: run folders.
-        out: the folder of compare.html, compare.png and compare.json; it is created if it is missing.
+        out: the folder of compare.html and compare.json; it is created if it is missing.
 
     Returns:
         The path of compare.html.
@@ -103,13 +103,10 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
 
 
 def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
-    """Write the page, its picture and its numbers; return the path of the page. Raises `InputError` if `out` cannot be written to."""
-    from unrender.app.report.equal_time import overview_figure  # matplotlib takes a second to import
-
+    """Write the page and its numbers; return the path of the page. Raises `InputError` if `out` cannot be written to."""
     folder = Path(out)
     write(folder / "compare.json", _numbers(comparison, notices))
     with np.errstate(over="ignore", invalid="ignore"):
-        write(folder / "compare.png", overview_figure(comparison))
         return write(folder / "compare.html", _page(comparison, notices))
 
 

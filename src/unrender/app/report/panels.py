@@ -230,14 +230,8 @@ class ColourScale:
         if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
             self.low, self.high = min(0.0, self.low), max(1.0, self.high)
 
-    def colours(self, plane: np.ndarray) -> np.ndarray:
-        """Map (H, W, C) values to (H, W, 3) display colours in [0, 1]."""
-        if plane.shape[-1] == 1:
-            return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high)
-        return tone_mapping.srgb(plane[..., :3] * self.factor)
-
     def picture(self, encoder: PictureEncoder, plane: np.ndarray, alt: str) -> Picture:
-        """Encode (H, W, C) values as a picture of the page, in the same colours as `colours`."""
+        """Encode (H, W, C) values as a picture of the page."""
         if plane.shape[-1] == 1:
             return encoder.false_colour(plane[..., 0], self.low, self.high, alt)
         return encoder.colour(plane[..., :3], self.factor, alt)
