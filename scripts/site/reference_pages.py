@@ -163,7 +163,7 @@ print(result.status, result.parameters, result.verification["best"])
             *("function unrender.runs.uncertainty", "function resume"),
             *("function unrender.app.distribute", "function unrender.app.sweep"),
             *("class unrender.app.sweeps.record.SweepRecord", "class Result"),
-            *("class unrender.runs.Live", "class unrender.runs.TensorBoard", "class unrender.core.random.Key"),
+            *("class unrender.runs.Live", "class unrender.core.random.Key"),
             *("function unrender.app.export", "function unrender.app.import_capture"),
             *("class unrender.app.ImportOptions", "class unrender.app.capture.importing.Imported"),
             *("function unrender.app.judge", "class unrender.app.evaluation.judge.Judgement"),

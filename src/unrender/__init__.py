@@ -88,7 +88,6 @@ _MOVED = {
     "Live": "runs.Live",
     "LossValues": "estimators.LossValues",
     "StockGradient": "estimators.StockGradient",
-    "TensorBoard": "runs.TensorBoard",
     "deal": "app.distribute",
     "export": "app.export",
     "import_capture": "app.import_capture",

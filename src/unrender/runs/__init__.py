@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 from unrender.core import lazy
 
 if TYPE_CHECKING:
-    from unrender.runs.callbacks import TensorBoard
     from unrender.runs.image_sensitivity import sensitivity
     from unrender.runs.live import Live
     from unrender.runs.map_uncertainty import uncertainty
 
 __getattr__, _ = lazy.attach(
     __name__,
-    {"Live": "live", "TensorBoard": "callbacks", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"},
+    {"Live": "live", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"},
 )
-__all__ = ["Live", "TensorBoard", "sensitivity", "uncertainty"]
+__all__ = ["Live", "sensitivity", "uncertainty"]

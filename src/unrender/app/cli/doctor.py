@@ -25,7 +25,6 @@ _FEATURES = {
     "sweep": "sweeps by tpe",
     "denoise": "denoised images on the CPU",
     "flip": "the measure FLIP",
-    "tensorboard": "TensorBoard",
     "torch": "functions behind a network, perceptual losses",
     "dev": "tests of this package",
     "docs": "its documentation",
