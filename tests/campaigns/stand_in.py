@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 
 from unrender.app.distributed.actor import ViewWorker
-from unrender.app.distributed.messages import Call, Difference, Reply
+from unrender.app.distributed.messages import Call, Reply
 
 __all__ = ["StandIn", "stand_ins"]
 
@@ -44,11 +44,10 @@ class StandIn(ViewWorker):
         """What `ViewShare.run` answers, of zeros and ones."""
         began, views = time.perf_counter(), self._views[share]
         for number, value in arrays.items():
-            self._arrays[number] = value.applied(self._arrays[value.base]) if isinstance(value, Difference) else value
+            self._arrays[number] = value
         for number in call.drop_arrays:
             self._arrays.pop(number, None)
-        kind = np.float32 if call.single else np.float64
-        gradient = {key: np.full(self._arrays[n].shape, 1 + share, kind) for key, n in call.parameters.items()}
+        gradient = {key: np.full(self._arrays[n].shape, 1 + share, np.float64) for key, n in call.parameters.items()}
         time.sleep(max(self.seconds * len(views) - (time.perf_counter() - began), 0.0))
         return Reply(gradient, {}, {}, dict.fromkeys(views, 1.0), 1, {}, {}, time.perf_counter() - began)
 

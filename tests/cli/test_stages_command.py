@@ -196,7 +196,6 @@ def test_options_that_stand_in_the_file_are_refused(unrender: Unrender, staged: 
     assert "--set spp: not supported with stages" in unrender(*RUN, "--set", "spp=2").error
     assert "--method: not supported with stages" in unrender(*RUN, "--method", "rcv").error
     assert "--no-cache: not supported with stages; leave it out" in unrender(*RUN, "--no-cache").error
-    assert "--compress: requires --workers" in unrender("resume", ".", "--compress").error
     assert "--insecure: requires --workers" in unrender("resume", ".", "--insecure").error
     assert not (staged / "result").exists()
 

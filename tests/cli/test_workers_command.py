@@ -22,11 +22,6 @@ compare = import_module("unrender.app.cli.compare")
     [
         (["--workers", "two"], "--workers two: expected auto, a number, the address HOST:PORT"),
         (["--workers", "0"], "--workers 0: expected"),
-        (
-            ["--workers", "1", "--compress"],
-            "--compress: requires other processes, but --workers 1 is this process; use more workers",
-        ),
-        (["--compress"], "--compress: requires --workers"),
     ],
 )
 def test_bad_words_are_one_line(words: list[str], line: str, capfd: Any, tmp_path: Any) -> None:

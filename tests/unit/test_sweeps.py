@@ -151,8 +151,7 @@ def searches(kind: str) -> Search:
 @pytest.mark.parametrize("kind", ["random", "tpe"])
 def test_the_outcome_does_not_depend_on_workers_nor_on_who_is_first(kind: str) -> None:
     found = [
-        carry_out(Trials(searches(kind), window=6), workers, random.Random(workers))
-        for workers in (1, 2, 3, 6, 20)
+        carry_out(Trials(searches(kind), window=6), workers, random.Random(workers)) for workers in (1, 2, 3, 6, 20)
     ]
     assert all(one == found[0] for one in found)
     statuses = [status for _, status, _ in found[0]]

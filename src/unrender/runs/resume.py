@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unrender.backend.versions import deciding_versions
-from unrender.core import arrays, trees
+from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
@@ -40,7 +40,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
 _WARNINGS = "warnings"
-_SENT, _CANDIDATE, _AHEAD, _NUMBERS, _PICTURES = "sent", "candidate", "ahead", "numbers", "pictures"
+_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES = "candidate", "ahead", "numbers", "pictures"
 _OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, "few_steps", "other_start")
 """Parts of a snapshot that only some runs have."""
 
@@ -130,10 +130,6 @@ def resume_run(
             raise InputError(f"run folder {folder}: no checkpoint can be used")
     raise_termination(run)
     return result
-
-
-class _SentOtherwise(InputError):
-    """A checkpoint of a run whose parameters were sent to workers in another encoding."""
 
 
 class _UnusableCheckpoint(InputError):
@@ -237,8 +233,6 @@ class _Restore(Callback):
     ) -> dict[str, Any]:
         try:
             return _unpack(source, fresh, warm, shapes)
-        except _SentOtherwise:
-            raise
         except InputError as error:
             raise _UnusableCheckpoint(str(error)) from error
 
@@ -249,12 +243,6 @@ def _unpack(
     """Return the snapshot of a checkpoint, after checking its types and shapes against this run's."""
     saved = unpack(source.packed, [fresh, warm])
     where = f"checkpoint of step {source.manifest.step}"
-    if isinstance(saved, dict) and (_SENT in saved) != (_SENT in fresh):
-        words = (
-            "whole: resume it without --compress",
-            "as 16-bit differences: resume it with --workers and --compress",
-        )
-        raise _SentOtherwise(f"{where}: the run sent its parameters {words[_SENT in saved]}")
     if not isinstance(saved, dict) or [n for n in saved if n not in _OPTIONAL] != [
         n for n in fresh if n not in _OPTIONAL
     ]:
@@ -263,7 +251,7 @@ def _unpack(
     if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
         raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
-        if name not in (_WARNINGS, _SENT, *_OPTIONAL):
+        if name not in (_WARNINGS, *_OPTIONAL):
             try:
                 check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
             except InputError as error:
@@ -281,8 +269,6 @@ def _unpack(
     for name in ("parameters", "optimizer"):
         if part := not_finite(saved[name], name):
             raise InputError(f"{where}: {part}: not finite")
-    if _SENT in saved:
-        _check_sent(saved[_SENT], expected, f"{where}: {_SENT}")
     if _CANDIDATE in saved:
         _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
     if _NUMBERS in saved:
@@ -313,19 +299,3 @@ def _check_candidate(candidate: Any, shapes: Mapping[str, tuple[int, ...]], wher
         raise InputError(f"{where}: expected shapes {shapes}, got { {key: x.shape for key, x in values.items()} }")
     if part := not_finite(values, "parameters"):
         raise InputError(f"{where}: {part}: not finite")
-
-
-def _check_sent(sent: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    if not isinstance(sent, dict) or (sent and sent.keys() != shapes.keys()):
-        raise InputError(f"{where}: expected what workers have of {', '.join(shapes)}, got {repr(sent)[:60]}")
-    for key, pair in sent.items():
-        if not isinstance(pair, dict) or pair.keys() != {"exact", "sent"}:
-            raise InputError(f"{where}: {key}: expected exact and sent, got {repr(pair)[:60]}")
-        for name, value in pair.items():
-            if not isinstance(value, np.ndarray) and (name == "sent" or not arrays.is_drjit(value)):
-                raise InputError(f"{where}: {key}: {name}: expected an array, got {repr(value)[:60]}")
-            shape = arrays.shape(value)
-            if len(shape) != len(shapes[key]) or any(a > b for a, b in zip(shape, shapes[key], strict=True)):
-                raise InputError(f"{where}: {key}: {name}: expected shape {shapes[key]}, got {shape}")
-        if part := not_finite(pair, f"{where}: {key}"):
-            raise InputError(f"{part}: not finite")

@@ -164,9 +164,9 @@ class Run:
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
-        state, noise, executor = self.state, self.state.noise, self.problem.executor
+        state, noise = self.state, self.state.noise
         candidate = None if state.candidate is None else vars(state.candidate)
-        parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
+        parts = {"candidate": candidate, "ahead": self.ahead or None}
         parts |= {"few_steps": self.few_steps or None, "other_start": state.other_start or None}
         parts |= {"numbers": state.numbers.snapshot(), "pictures": state.pictures or None}
         return {
@@ -175,7 +175,7 @@ class Run:
             "clock": self.clock,
             "skipped": self.skipped,
             "warnings": list(self.warnings),
-            "estimator": executor.collect(state.estimator),
+            "estimator": self.problem.executor.collect(state.estimator),
             "optimizer": state.optimizer,
             "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
             "zero_gradient": dict(state.zero_gradient),
@@ -197,7 +197,6 @@ class Run:
         state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
         state.numbers = NumberTrace.restored(saved.get("numbers"))
         state.other_start, state.pictures = str(saved.get("other_start") or ""), saved.get("pictures", {})
-        self.problem.executor.restore(saved.get("sent"))
 
 
 @dataclass(frozen=True)

@@ -38,14 +38,6 @@ class Executor(Protocol):
         """Replace placeholders in a state by the workers' states, for checkpoints."""
         ...
 
-    def snapshot(self) -> Any:
-        """Return the data other than states on which the next steps depend, for checkpoints; None if there is none."""
-        ...
-
-    def restore(self, saved: Any) -> None:
-        """Continue from the result of `snapshot`."""
-        ...
-
 
 class LocalExecutor:
     """Executor that computes everything in this process."""
@@ -69,12 +61,6 @@ class LocalExecutor:
 
     def collect(self, state: Any) -> Any:
         return state
-
-    def snapshot(self) -> Any:
-        return None
-
-    def restore(self, saved: Any) -> None:
-        del saved
 
 
 LOCAL = LocalExecutor()

@@ -76,9 +76,8 @@ def execution(
     settings = {name: value for name, value in settings.items() if value}
     for line in watches.remarks(problem, plan.optimizer):
         console.say(f"note: {line}")
-    annotations = RunAnnotations(
-        order.method.name, settings, plan.lines, order.command, order.final_spp, _earlier(progress), progress.budget_began
-    )
+    times = _earlier(progress), progress.budget_began
+    annotations = RunAnnotations(order.method.name, settings, plan.lines, order.command, order.final_spp, *times)
     live = Live(directory, problem.name, order.method.name, order.command)
     yield {
         "problem": problem,

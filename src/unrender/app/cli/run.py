@@ -25,25 +25,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.scene.problem import Problem
 
-Compress = Annotated[
-    bool,
-    typer.Option(
-        "--compress",
-        help="With --workers: send parameters as 16-bit differences and gradients in single precision, half the bytes.",
-        show_default=False,
-    ),
-]
-
-
-def check_workers(workers: str | None, compress: bool, insecure: bool = False) -> Workers | None:
-    """Return `arguments.workers`. Raise `InputError` also for --compress without other processes."""
-    if compress and workers is None:
-        raise InputError("--compress: requires --workers")
-    parsed = arguments.workers(workers, insecure)
-    if compress and parsed is None:
-        raise InputError("--compress: requires other processes, but --workers 1 is this process; use more workers")
-    return parsed
-
 
 def variant_again(typed: str | None, record: RunRecord) -> str:
     """Return the Mitsuba variant of the workers of a resumed run: the typed one, else the run's, else `auto`."""
@@ -55,7 +36,7 @@ def variant_again(typed: str | None, record: RunRecord) -> str:
 
 @contextlib.contextmanager
 def distributed(
-    problem: Problem, workers: Workers | None, compress: bool, variant: str, threads: int | None, console: Console
+    problem: Problem, workers: Workers | None, variant: str, threads: int | None, console: Console
 ) -> Iterator[Problem]:
     """Yield the problem with its views distributed to workers; the problem itself for None. See `unrender.app.distribute`."""
     if workers is None:
@@ -70,7 +51,7 @@ def distributed(
 
     with contextlib.ExitStack() as stack:
         with phases.phase("workers"):
-            inner = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
+            inner = stack.enter_context(distribute(problem, workers, variant, threads, tell))
         yield inner
 
 
@@ -105,7 +86,6 @@ def run(
     threads: arguments.Threads = None,
     no_cache: arguments.NoCache = False,
     workers: arguments.WorkersOption = None,
-    compress: Compress = False,
     allow_outside: arguments.AllowOutside = False,
     insecure: arguments.Insecure = False,
 ) -> None:
@@ -123,7 +103,7 @@ def run(
 
     console, command = Console(highlight=False), arguments.command_line(context)
     with Progress(console) as progress:  # options are refused before the slow imports of "loading"
-        chosen, processes = _method(method_name), check_workers(workers, compress, insecure)
+        chosen, processes = _method(method_name), arguments.workers(workers, insecure)
         if arguments.is_stages(problem):
             stages.refuse_settings(method_name, values, options, workers, no_cache)
             first = seed if "--seed" in arguments.typed_options(context) else None
@@ -141,7 +121,7 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            with distributed(opened, processes, compress, variant, threads, console) as shared:
+            with distributed(opened, processes, variant, threads, console) as shared:
                 task = RunOrder(chosen, values, *budget, seed, final_spp, command, options, checkpoint_every)
                 with execution(shared, task, folder, console, progress) as order:
                     result = optimize(**order)
@@ -235,7 +215,6 @@ def resume(
     variant: Annotated[str | None, typer.Option(help="Mitsuba's variant. [default: the run's]")] = None,
     threads: arguments.Threads = None,
     workers: arguments.WorkersOption = None,
-    compress: Compress = False,
     allow_outside: arguments.AllowOutside = False,
     insecure: arguments.Insecure = False,
 ) -> None:
@@ -254,7 +233,7 @@ def resume(
         if force:
             raise InputError(f"{directory}: --force applies to the run folder of a stage; give that instead")
         stages.refuse_workers(workers)
-        check_workers(None, compress, insecure)  # options of workers
+        arguments.workers(None, insecure)
         command = arguments.command_line(context)
         with Progress(console) as progress:
             return stages.run_remaining(
@@ -266,13 +245,13 @@ def resume(
             from unrender.runs import reopen
             from unrender.runs.resume import load_run
 
-            processes = check_workers(workers, compress, insecure)
+            processes = arguments.workers(workers, insecure)
             stored = load_run(directory, steps, seconds)
             alone = 1 if stored.method.threads == 1 else None  # such a run is reproducible bit for bit
             running = arguments.use_variant(variant or stored.record.variant or "auto", threads or alone)
             problem = reopen.problem_of(directory)
         introduce(console, problem, running)
         theirs = variant_again(variant, stored.record)
-        with distributed(problem, processes, compress, theirs, threads or alone, console) as shared:
+        with distributed(problem, processes, theirs, threads or alone, console) as shared:
             result = resumed(stored, shared, progress, force)
         conclude(console, problem, result, directory, progress)

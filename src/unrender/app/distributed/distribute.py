@@ -29,7 +29,6 @@ _GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5
 def distribute(
     problem: Problem,
     workers: int | str | Workers = "auto",
-    compress: bool = False,
     variant: str = "auto",
     threads: int | None = None,
     tell: Callable[[str], None] = _log.warning,
@@ -52,9 +51,6 @@ def distribute(
     Args:
         problem: problem with at least one view; there is at most one worker per view.
         workers: number of workers; "auto", one for each GPU or core; "HOST:PORT" of a Ray cluster, or "NUMBER@HOST:PORT".
-        compress: whether parameters are sent as float16 differences from the workers' values, and gradients are returned in single
-            instead of double precision. This halves the traffic, and gradients are at values that differ from the run's by up to 2⁻¹¹
-            of the last step. Checkpoints of such a run can only be resumed with `compress`.
         variant: Mitsuba variant of the workers; "auto" for one with the colours of this process's variant.
         threads: processor threads per worker; None for its share.
         tell: function that receives a line for each lost or lagging worker.
@@ -83,7 +79,7 @@ def distribute(
         shares = assign(pixels, cluster.share.count)
         hosts = RayHosts(cluster, shares, tuple(packed(problem, share, cluster.ray) for share in shares), threads, tell)
         try:
-            yield problem.with_parts(executor=DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
+            yield problem.with_parts(executor=DistributedExecutor(problem, shares, hosts, cluster.variant))
         finally:
             hosts.close()
 

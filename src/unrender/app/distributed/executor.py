@@ -61,7 +61,6 @@ class DistributedExecutor:
 
     Args:
         problem: the full problem.
-        compress: see `Outbox`.
         variant: see `Executor.variant`.
     """
 
@@ -70,12 +69,11 @@ class DistributedExecutor:
         problem: Problem,
         shares: tuple[tuple[int, ...], ...],
         hosts: Hosts,
-        compress: bool = False,
         variant: str = "",
     ):
         self.variant = variant
         self._problem, self._shares, self._hosts = problem, shares, hosts
-        self._outbox, self._memories = Outbox(compress), Memories()
+        self._outbox, self._memories = Outbox(), Memories()
         self._arrays: list[set[int]] = [set() for _ in shares]
         self._present: list[set[int]] = [set() for _ in shares]
         self._recent: list[set[int]] = [set() for _ in shares]
@@ -184,12 +182,6 @@ class DistributedExecutor:
             return state if same else type(state)(collected)
         return state
 
-    def snapshot(self) -> Any:
-        return self._outbox.snapshot()
-
-    def restore(self, saved: Any) -> None:
-        self._outbox.restore(saved)
-
     # ------------------------------------------------------------------ requests to calls
 
     def _memory(self, state: Any) -> Memory | None:
@@ -236,14 +228,13 @@ class DistributedExecutor:
             fresh=request.fresh,
             noise=request.noise,
             pictures=self._calls % _PICTURES_EVERY == 1,
-            single=self._outbox.compress,
         )
         return call, sent
 
     def _addressed(self, share: int, call: Call, sent: Mapping[int, Sent]) -> Call:
         """Return the call with the arrays that a share lacks, and with the numbers that it may drop."""
         present = self._arrays[share]
-        missing = {number: one.payload(present) for number, one in sorted(sent.items()) if number not in present}
+        missing = {number: one.value for number, one in sorted(sent.items()) if number not in present}
         old = present - set(sent) - self._recent[share]
         gone = {number for number in self._present[share] if not self._memories.is_alive(number)}
         if call.state is not None:

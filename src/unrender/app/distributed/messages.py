@@ -16,23 +16,6 @@ References = dict[str, int]
 
 
 @dataclass(frozen=True)
-class Difference:
-    """An array as its difference from one that the worker has.
-
-    Attributes:
-        base: the number of that array.
-        values: the difference, float16.
-    """
-
-    base: int
-    values: np.ndarray
-
-    def applied(self, base: np.ndarray) -> np.ndarray:
-        """Return the array: the base plus the difference."""
-        return (base + self.values.astype(base.dtype)).astype(base.dtype)
-
-
-@dataclass(frozen=True)
 class Pair:
     """A `PairRequest`, with the numbers of its arrays."""
 
@@ -90,7 +73,6 @@ class Call:
         result: number of the memory after this step; None for none.
         replay: whether only this memory is needed.
         pictures: whether images are requested.
-        single: whether gradients are returned in single instead of double precision.
         spp, adjoint_spp, key, pair, tolerance, fresh, noise: fields of the request.
         batch: the pixels; None for full views.
         pilot: references of these pixels, (N, 3) each, if their paths are requested instead of a gradient, see `PilotRequest`.
@@ -113,8 +95,7 @@ class Call:
     result: int | None = None
     replay: bool = False
     pictures: bool = False
-    single: bool = False
-    arrays: dict[int, np.ndarray | Difference] = field(default_factory=dict)
+    arrays: dict[int, np.ndarray] = field(default_factory=dict)
     drop_arrays: tuple[int, ...] = ()
     drop_memories: tuple[int, ...] = ()
 
@@ -152,7 +133,7 @@ def payload_bytes(message: Any) -> int:
     """Return the bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Call, Reply, Difference, Batch, DrawStatistics)):
+    if isinstance(message, (Call, Reply, Batch, DrawStatistics)):
         message = vars(message)
     parts = message.values() if isinstance(message, dict) else message if isinstance(message, tuple) else ()
     return sum(map(payload_bytes, parts))

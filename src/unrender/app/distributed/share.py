@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unrender.app.distributed.assignment import total
-from unrender.app.distributed.messages import Batch, Call, Difference, References, Reply
+from unrender.app.distributed.messages import Batch, Call, References, Reply
 from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.estimators.sample_groups import TREES, GradientRequest, leave_one_out_groups
@@ -35,7 +35,6 @@ class ViewShare:
 
     def __init__(self, problem: Problem, views: tuple[int, ...]):
         self.problem, self.views = problem, views
-        self._host: dict[int, np.ndarray] = {}
         self._arrays: dict[int, Any] = {}
         self._memories: dict[int, tuple[Any, ...]] = {}
         self._snapshot: tuple[int, Any] | None = None
@@ -62,8 +61,6 @@ class ViewShare:
         if call.batch is None:
             self._remember(call, states)
         sums = {name: total(map(trees.numpy, parts)) for name, parts in parts_by_name.items()}
-        if call.single:
-            sums = {name: {key: value.astype(np.float32) for key, value in tree.items()} for name, tree in sums.items()}
         shown = [(index, part) for (index, _), part in zip(frames, parts, strict=True) if call.pictures and index >= 0]
         info: dict[str, dict[int, np.ndarray]] = {}
         for index, part in shown:
@@ -95,10 +92,8 @@ class ViewShare:
 
     def _receive(self, call: Call) -> None:
         for number, value in call.arrays.items():
-            received = value.applied(self._host[value.base]) if isinstance(value, Difference) else value
-            self._host[number], self._arrays[number] = received, self.problem.renderer.array(received)
+            self._arrays[number] = self.problem.renderer.array(value)
         for number in call.drop_arrays:
-            self._host.pop(number, None)
             self._arrays.pop(number, None)
         for number in call.drop_memories:
             self._memories.pop(number, None)
