@@ -63,7 +63,7 @@ def plan(problem: ur.Problem, option: str = "") -> Plan:
     own, part = method("auto"), PARTS.get(option, {})
     if callable(part):
         return part(own.plan(problem))
-    return own.plan(problem, part or (dict([option.split("=")]) if option else {}))
+    return own.configure(part or (dict([option.split("=")]) if option else {})).plan(problem)
 
 
 def changes(problem: ur.Problem, part: str) -> bool:

@@ -597,7 +597,7 @@ def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: 
     assert any("coarse to fine" in reason for reason in choice.reasons) == bool(steps)
     detailed = truth + np.arange(cells[0]).reshape(-1, *(1,) * len(cells)) * 0.01
     for others, options in (
-        (unknown, {"coarse": False}),
+        (unknown, {"coarse": False} if steps else {}),
         (replace(unknown, initial=detailed), {}),  # detail that coarse cells would lose
         (replace(unknown, coarse_to_fine=(5,)), {}),
     ):

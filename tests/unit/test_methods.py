@@ -92,7 +92,7 @@ def test_smoothed_takes_its_options():
     ]
     for name, order, made in cases:
         estimator, optimizer = method("smoothed").start({**settings, "optimizer": name})
-        assert estimator == SmoothedDerivatives(0.4, 16, order, joint=False, spp=4)
+        assert estimator == SmoothedDerivatives(0.4, 16, order, joint=order == "gradient", spp=4)
         assert optimizer == made
     estimator, _ = method("smoothed").start({"sigma": "0.2, mug.rotation.y=0.6"})
     assert estimator == SmoothedDerivatives(

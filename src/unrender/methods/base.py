@@ -14,6 +14,7 @@ from unrender.core import registry, tables
 from unrender.core.errors import InputError, UnknownOptionError
 from unrender.core.text import did_you_mean, grouped
 from unrender.estimators.base import Estimator
+from unrender.methods import effects
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.scene.problem import Problem
@@ -102,13 +103,28 @@ class Method:
         """Return estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
         options = self.configure(settings or {})
         with self._named():
-            return options.build()
+            parts = options.build()
+            if self.options.plan is Options.plan:  # otherwise the problem decides which options have an effect
+                for name in settings or {}:
+                    effects.check(options, name, lambda one: one.build())
+            return parts
 
     def plan(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Plan:
-        """Return the plan for a problem, with `settings` in place of defaults. Raises `InputError`."""
+        """Return the plan for a problem, with `settings` in place of defaults. Raises `InputError`, also for one without effect."""
         options = self.configure(settings or {})
         with self._named():
-            return options.plan(problem)
+            plan = options.plan(problem)
+            for name in settings or {}:
+                effects.check(options, name, lambda one: _decisions(one.plan(problem)))
+            return plan
+
+    def with_effect(self, problem: Problem, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that change the plan for a problem. Raises `InputError`."""
+        options = self.configure(settings)
+        with self._named():
+            options.plan(problem)
+            decide: effects.Decide = lambda one: _decisions(one.plan(problem))  # noqa: E731
+            return {name: x for name, x in settings.items() if effects.has_effect(options, name, decide)}
 
     @contextmanager
     def _named(self) -> Iterator[None]:
@@ -117,6 +133,11 @@ class Method:
             yield
         except InputError as error:
             raise InputError(f"method {self.name}: {error}") from error
+
+
+def _decisions(plan: Plan) -> tuple[Any, ...]:
+    """Return all of a plan but its reasons."""
+    return plan.estimator, plan.optimizer, dict(plan.settings), plan.other_starts
 
 
 def parameterised(problem: Problem) -> tuple[str, ...]:

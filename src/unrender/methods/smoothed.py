@@ -14,6 +14,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from unrender import optimizers, pixels
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimator
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
@@ -51,7 +52,7 @@ class SmoothedMethod(Options):
     sigma: PositiveFloat | str | None = Field(None, description=f"initial {SIGMA_HELP}")
     sigma_schedule: str | None = Field(
         "exponential(25, 0.1)",
-        description="factor of sigma by step, such as cosine(300); with adam, also of its learning rate; unused by cma-es",
+        description="factor of sigma by step, such as cosine(300); with adam, also of its learning rate; cma-es has none",
     )
     step: PositiveFloat = Field(
         0.5, description="relative to sigma: longest step; learning rate of adam; first standard deviation of cma-es"
@@ -85,7 +86,8 @@ class SmoothedMethod(Options):
         scaled = {key: self.step * common * unit for key, unit in units.items()}
         rate = scaled if own else self.step * common
         order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
-        estimator = SmoothedDerivatives(sigma, self.samples, order, joint=self.joint, spp=self.spp, schedule=schedule)
+        joint = self.joint or order == "gradient"
+        estimator = SmoothedDerivatives(sigma, self.samples, order, joint=joint, spp=self.spp, schedule=schedule)
         made: dict[str, Callable[[], Optimizer]] = {
             "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
             "newton": lambda: optimizers.Newton(trust_radius=self.step),
@@ -196,6 +198,8 @@ def parse_widths(
             widths[key.strip() or "*"] = _WIDTH.validate_python(number.strip())
         except pydantic.ValidationError as error:
             raise InputError(f"sigma: expected a number above 0, got {number.strip()!r}") from error
+    if problem and (unknown := next((key for key in widths if key != "*" and key not in problem.unknowns), None)):
+        raise InputError(f"sigma names {unknown}, which is not a parameter{did_you_mean(unknown, problem.unknowns)}")
     if "*" not in widths:
         raise InputError(
             f"sigma: expected a number for the other parameters too, as in 0.2, mug.rotation.y=0.6, got {sigma!r}"
