@@ -230,6 +230,20 @@ def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: p
     assert "the references leave it open" in final_images.render_final_images(made, result).undetermined
 
 
+def test_a_line_about_an_unknown_leaves_one_whose_name_it_contains_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line of "bigball" silenced those of "ball"."""
+    of = {"ball": np.full(3, 0.5), "bigball": np.full(3, 0.5)}
+    renderer = AnalyticRenderer(of, np.random.default_rng(0).random((16 * 16 * 3, 6)), 0.1, 0.1, shape=SHAPE)
+    made = Problem(renderer, [Parameter(key) for key in of], [View(renderer.exact(of))])
+    check = least_squares.NumbersCheck({"ball": "ball: open"}, {"ball": "ball: it moves"}, unchecked=("ball",))
+    monkeypatch.setattr(final_images, "check_numbers", lambda *_: check)
+    monkeypatch.setattr(final_images, "undetermined", lambda *_: ["bigball: the pictures do not show it"])
+    result = Result(of, of, [{}], 30.0, 0.0, "steps")
+    found = final_images.render_final_images(made, result)
+    assert "ball: open" in found.undetermined
+    assert "ball: it moves" in found.warnings
+
+
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:
     class Slow(Callback):
         def on_step(self, run: Run, record: dict[str, Any]) -> None:

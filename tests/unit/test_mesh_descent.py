@@ -19,6 +19,7 @@ from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
+from unrender.runs import loop
 from unrender.runs.watches import InfluenceWatch, MeshWatch
 from unrender.scene.meshes import (
     MeshRegularizer,
@@ -396,6 +397,14 @@ def test_a_mesh_that_passes_through_itself_is_told_beside_another_whose_name_end
     (line,) = MeshWatch().warnings(run)
     run.warnings = [f"step 25: big{line}"]
     assert MeshWatch().warnings(run) == [line]
+
+
+def test_a_shortened_step_is_told_beside_that_of_a_mesh_whose_name_ends_alike() -> None:
+    made = {key: SimpleNamespace(parameter=SimpleNamespace(self_intersection="warn")) for key in ("ball", "bigball")}
+    run: Any = SimpleNamespace(problem=SimpleNamespace(unknowns=made), step=3, warnings=[])
+    for keys in (("bigball",), ("ball",), ("ball", "bigball")):
+        loop._warn_of_shortened(run, keys)
+    assert [line.partition(": tri")[0] for line in run.warnings] == ["step 3: bigball", "step 3: ball"]
 
 
 def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step() -> None:

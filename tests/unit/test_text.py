@@ -15,7 +15,17 @@ from rich.table import Table
 
 from unrender.app.report import html
 from unrender.core.errors import InputError, VariantError
-from unrender.core.text import LONGEST_LINE, did_you_mean, grouped, listed, one_line, printable, shorten, visible
+from unrender.core.text import (
+    LONGEST_LINE,
+    did_you_mean,
+    grouped,
+    listed,
+    names_in,
+    one_line,
+    printable,
+    shorten,
+    visible,
+)
 from unrender.display.terminal import Console, columns, echo
 
 EVIL = {
@@ -145,3 +155,11 @@ def test_a_table_has_its_values_beside_keys_of_any_length(key: str, width: int) 
     text = "".join(printed.file.getvalue().split())  # pyright: ignore[reportAttributeAccessIssue]
     assert "0.3366" in text
     assert sorted(text) == sorted(f"{key}error0.3366before")
+
+
+def test_names_in_a_text_are_whole_ones() -> None:
+    known = ["ball", "ball.x", "bigball", "ball-2", "lamp"]
+    assert names_in("bigball: it moves; ball.x and ball-2, lamps", known) == {"bigball", "ball.x", "ball-2"}
+    assert names_in("ball.y: a", known) == set()
+    assert names_in("of ball.\nlamp: b", known) == {"ball", "lamp"}
+    assert names_in("ball", []) == set()

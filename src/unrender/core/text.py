@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -37,6 +38,12 @@ def listed(names: Sequence[str]) -> str:
     if len(names) <= 2 * _NAMED:
         return ", ".join(names)
     return f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
+
+
+def names_in(text: str, names: Iterable[str]) -> set[str]:
+    """Return the names that a text contains in full: "bigball" does not contain "ball"."""
+    alternatives = "|".join(map(re.escape, sorted(filter(None, names), key=len, reverse=True)))
+    return set(re.findall(rf"(?<![\w.-])(?:{alternatives})(?![\w-]|\.\w)", text)) if alternatives else set()
 
 
 def grouped(values: Mapping[str, str]) -> str:

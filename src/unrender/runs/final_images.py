@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from unrender.core import phases
+from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import (
@@ -261,13 +262,13 @@ def _undetermined(
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
-    text = "\n".join(line for line in lines if TOO_SHORT not in line)  # lines about what was tested
+    told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     if fits:
-        lines += [line for key, line in numbers.undetermined.items() if key not in text]
-        lines += numbers.missing([key for key in numbers.unchecked if key in text] + [*numbers.undetermined])
+        lines += [line for key, line in numbers.undetermined.items() if key not in told]
+        lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])
         lines += numbers.noisy(result.standard_error)
     failed = result.status == "failed"  # such a run did not end by its budget
-    unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
+    unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in told)
     return lines, unfinished, deviations, [*numbers.undetermined]
 
 

@@ -189,7 +189,7 @@ def _not_finite(estimate: Estimate) -> str:
 
 
 def _warn_once(run: Run, line: str) -> None:
-    if not any(known.endswith(line) for known in run.warnings):
+    if not any(known.endswith(f": {line}") for known in run.warnings):
         run.warnings.append(f"step {run.step}: {line}")
 
 
