@@ -280,3 +280,25 @@ def test_a_sphere_becomes_the_body_by_large_steps() -> None:
     result = ur.optimize(problem, ur.PathGradient(spp=8), ur.optimizers.Adam(0.03, uniform=True), steps=25)
     assert result.history[-1]["loss"] < 0.5 * result.history[0]["loss"]
     assert result.skipped == 0
+
+
+def test_a_mesh_that_touches_or_crosses_another_shape_is_told_once() -> None:
+    def lines(height: float, **more: Any) -> list[str]:
+        floor = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(3)
+        described = scene(**more)
+        described["floor"]["to_world"] = floor
+        return [line for line in MitsubaRenderer(described, 2, [KEY]).notices if "touches" in line]
+
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T * 0.3
+    sides = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
+    block = {"thing": meshes.triangles("thing", corners, np.array(sides), {"type": "diffuse"})}
+    assert lines(-0.6) == lines(-0.6, **block) == []
+    assert len(lines(-0.35)) == 1  # the sphere reaches through the floor
+    assert lines(-0.3, **block) == [  # the block stands on it
+        "thing touches or crosses floor, where path gradients of its vertices are noisy and may be biased: leave a gap between them"
+    ]
+    diamond = 0.3 * np.concatenate([np.eye(3), -np.eye(3)])
+    around = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    stands = {"thing": meshes.triangles("thing", diamond, np.array(around), {"type": "diffuse"})}
+    assert lines(-0.3, **stands) == []  # one point of it rests on the floor
+    assert not [line for line in MitsubaRenderer(scene(), 2, ["thing.translation"]).notices if "touches" in line]
