@@ -99,10 +99,6 @@ MISTAKES += [  # options that would be ignored
         )
     ),
     (["compare", ".", "-p", "resolution=8"], "compare: --problem-set does not apply to run folders"),
-    (["gallery", "--out", "drawn"], "gallery: --out needs the NAME of a problem"),
-    (["gallery", "exponential", "--spp", "4"], "gallery: --spp needs --out"),
-    (["gallery", "exponential", "--no-cache"], "gallery: --no-cache needs --out or --problem-set"),
-    (["gallery", "exponential", "-p", "loss=L1", "--overwrite"], "gallery: --overwrite needs --out"),
     (
         ["run", "problem.toml", "--no-cache"],
         "--no-cache: only the references of gallery problems are cached; leave it out",

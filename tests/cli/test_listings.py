@@ -58,18 +58,6 @@ def test_gallery_tells_the_options_of_one(unrender):
     assert all(option.name in answer.out for option in gallery.options(name))
 
 
-def test_gallery_draws_one(unrender, mitsuba_variant, tmp_path):
-    name = gallery.names()[0]
-    answer = unrender(
-        "gallery", name, "--out", "drawn", "-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=4",
-        "--spp", 4, "--variant", mitsuba_variant,
-    )  # fmt: skip
-    assert answer.status == 0
-    drawn = sorted(path.name for path in (tmp_path / "drawn").iterdir())
-    assert drawn == ["view0-reference.png", "view0-start.png", "view0-truth.png"]
-    assert "8x8" in answer.out
-
-
 def test_a_plan_is_printed_and_its_file_makes_the_same_run(unrender, tmp_path):
     tiny = ("-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8")
     common = ("--steps", "4", "--variant", "llvm_ad_rgb", "--final-spp", "1", "--threads", "1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from unrender.estimators.base import Estimator
 from unrender.rendering.parameter_errors import PLAIN
 from unrender.runs.folder.meshes import arrays_of
-from unrender.runs.folder.state import parts
 from unrender.runs.run import Run
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.problem import Problem
@@ -87,30 +86,7 @@ def recorded_measures(problem: Problem) -> dict[str, Any]:
     return {key: u.measure.record() for key, u in problem.unknowns.items() if u.measure != PLAIN}
 
 
-def fingerprint_of(run: Run, before: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the fingerprints of the problem, the estimator and the optimizer, without memory addresses.
-
-    Args:
-        before: fingerprints by an earlier version. Those that differ only by new options with their defaults are returned as they are.
-    """
+def fingerprint_of(run: Run) -> dict[str, str]:
+    """Return the fingerprints of the problem, the estimator and the optimizer, without memory addresses."""
     components = {"estimator": run.estimator, "optimizer": run.optimizer}
-    texts = {name: _ADDRESS.sub("", repr(part)) for name, part in components.items()}
-    for name in (name for name in texts if name in (before or {})):
-        pattern = re.escape(texts[name])
-        for option in map(re.escape, _defaults(components[name])):
-            pattern = pattern.replace(option, f"(?:{option})?")
-        if before and re.fullmatch(pattern, before[name]):
-            texts[name] = before[name]
-    return fingerprint(run.problem) | texts
-
-
-def _defaults(component: Any) -> dict[str, None]:
-    """Return ", name=value" for each option with its default of a component and of its parts, from the outside to the inside."""
-    texts: dict[str, None] = {}
-    for part in parts(component):
-        for each in fields(part) if is_dataclass(part) and not isinstance(part, type) else ():
-            value = repr(getattr(part, each.name))
-            default = each.default if each.default_factory is MISSING else each.default_factory()
-            if value == repr(default):
-                texts[f", {each.name}={value}"] = None
-    return texts
+    return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(part)) for name, part in components.items()}

@@ -182,7 +182,7 @@ def _sources(stored: StoredRun) -> Iterator[_Source]:
 def _changes(run: Run, stored: StoredRun, source: Checkpoint | None) -> str:
     """Return the changes since the checkpoint was written (or the run started), as phrases on one line."""
     before = stored.record.problem.fingerprint if source is None else source.manifest.problem
-    changed = [] if before is None else differences(before, fingerprint_of(run, before))
+    changed = [] if before is None else differences(before, fingerprint_of(run))
     if source is not None:
         changed += differences(source.manifest.versions, deciding_versions())
         changed += differences({"seed": str(source.manifest.seed)}, {"seed": str(stored.method.seed)})

@@ -56,8 +56,7 @@ def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
     """Restore a state.
 
     A class is looked up among frozen dataclasses that are already imported: those of this package, of the modules of registered
-    components, and those in `patterns`. The name of a module in a file never imports it. Fields that a file of an earlier version lacks
-    have their defaults.
+    components, and those in `patterns`. The name of a module in a file never imports it.
 
     Args:
         packed: result of `pack`.
@@ -249,7 +248,7 @@ class _Unpacker:
                 return self._dictionary(pairs, depth)
             case {"class": str(name), "fields": dict(fields), **rest} if not rest:
                 kind = self.classes.get(name) or _class(name)
-                if not _required(kind) <= set(fields) <= {each.name for each in dataclasses.fields(kind)}:
+                if set(fields) != {each.name for each in dataclasses.fields(kind)}:
                     names = ", ".join(fields)[:100]
                     raise InputError(
                         f"state: {name} is of another version of unrender (fields {names}); start the run again"
@@ -304,12 +303,6 @@ def parts(state: Any) -> Iterator[Any]:
         below = state
     for part in below:
         yield from parts(part)
-
-
-def _required(kind: Any) -> set[str]:
-    """Return the names of the fields without default."""
-    none = dataclasses.MISSING
-    return {each.name for each in dataclasses.fields(kind) if each.default is none and each.default_factory is none}
 
 
 def _is_state(kind: Any) -> bool:
