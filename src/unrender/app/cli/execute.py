@@ -13,12 +13,12 @@ from rich.markup import escape
 
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
+from unrender.losses.metrics import rmse
 from unrender.methods import Method
 from unrender.methods.plan import PlanFile
 from unrender.runs import watches
 from unrender.runs.callbacks import RUN_PHASES
 from unrender.runs.final_checks import image_name
-from unrender.runs.folder.reader import root_mean_square
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
@@ -115,10 +115,10 @@ def image_error(result: Result, which: str = "result") -> str:
         return formatting.with_error(*debiased.mean(known))
     named = result.pictures
     errors = [
-        root_mean_square(named[image_name(view, which)], named[f"view{view}/reference"], named.get(f"view{view}/mask"))
+        rmse(named[image_name(view, which)], named[f"view{view}/reference"], named.get(f"view{view}/mask"))
         for view in views
     ]
-    return f"{formatting.number(float(np.mean([error for error in errors if error is not None])))} with noise"
+    return f"{formatting.number(float(np.mean(errors)))} with noise"
 
 
 def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:

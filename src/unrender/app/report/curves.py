@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.losses import metrics
-from unrender.runs.folder.reader import RunFolder, root_mean_square
+from unrender.runs.folder.reader import RunFolder
 
 MOST_PIXELS = 1 << 21
 """Limit of the pixels that are measured, over all views. FLIP takes a second or two per megapixel."""
@@ -165,7 +165,7 @@ def relative_error(run: RunFolder, keys: Sequence[str], start: Mapping[str, floa
 def image_error(run: RunFolder) -> float | None:
     """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without
     pictures."""
-    return _mean([root_mean_square(view.result, view.reference, view.mask) for view in run.views.values()])
+    return _mean([metrics.rmse(view.result, view.reference, view.mask) for view in run.views.values()])
 
 
 def smoothed_loss(run: RunFolder, window: float) -> Series | None:

@@ -11,9 +11,10 @@ import numpy as np
 from unrender.app.report import curves, tone_mapping
 from unrender.display import formatting, plots
 from unrender.display.plots import Chart, Line
+from unrender.losses.metrics import rmse
 from unrender.rendering import parameter_errors
 from unrender.runs.callbacks import COMPILING
-from unrender.runs.folder.reader import RunFolder, root_mean_square
+from unrender.runs.folder.reader import RunFolder
 from unrender.runs.folder.schema import DOUBTFUL, RunRecord
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.statistics import debiased
@@ -152,9 +153,8 @@ def tiles(run: RunFolder) -> list[Tile]:
         all_tiles.append(measured)
     elif after is not None:
         views = run.views.values()
-        before = [root_mean_square(of.initial, of.reference, of.mask) for of in views if of.initial is not None]
-        known = [error for error in before if error is not None]
-        start = float(np.mean(known)) if len(known) == len(views) else None
+        before = [rmse(of.initial, of.reference, of.mask) for of in views if of.initial is not None]
+        start = float(np.mean(before)) if len(before) == len(views) else None
         all_tiles.append(_tile("Image error", start, after, "RMSE"))
     loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
     if loss is not None:
@@ -221,8 +221,8 @@ def view_rows(run: RunFolder) -> list[ViewRow]:
     return [
         ViewRow(
             view,
-            None if of.initial is None else root_mean_square(of.initial, of.reference, of.mask),
-            root_mean_square(of.result, of.reference, of.mask),
+            None if of.initial is None else rmse(of.initial, of.reference, of.mask),
+            rmse(of.result, of.reference, of.mask),
             measured.get(view, {}),
         )
         for view, of in run.views.items()

@@ -143,20 +143,6 @@ def read_record(path: Path, folder: Path) -> RunRecord:
     return schema.validate(RunRecord, bounded_files.read_object(path, folder), str(path))
 
 
-def root_mean_square(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """Return the root mean square difference of images (H, W, 3), with the weights of a mask (H, W).
-
-    None if shapes differ, or if there are no pixels.
-    """
-    if a.shape != b.shape or a.size == 0:
-        return None
-    with np.errstate(over="ignore", invalid="ignore"):
-        squares = np.asarray(np.mean((a - b) ** 2, axis=2, dtype=np.float64))
-        if mask is not None:
-            return float(np.sqrt(np.average(squares[mask > 0], weights=mask[mask > 0])))
-        return float(np.sqrt(np.mean(squares)))
-
-
 def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None) -> float | None:
     """Return the distance of a mesh from its true surface; None if there is none, or the mesh is not a surface."""
     if truth is None:
