@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -27,6 +28,7 @@ from unrender.app.capture.mesh import Mesh
 from unrender.app.capture.silhouettes import Silhouettes, overlap
 from unrender.app.capture.unknowns import DEFAULT, OF_HULL, parse
 from unrender.app.capture.views import prepare
+from unrender.app.evaluation.measures import fitted, sheet
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.backend import variant
@@ -202,15 +204,9 @@ def import_capture(
             name, chosen = folder.resolve().name, options.chosen(OF_HULL if options.mesh is None else DEFAULT)
             views = data.views, mesh, data.silhouettes
             problem_folder.write(place, name, *views, options.texture, chosen, options.band, data.turntable)
-            (place / SHEET).write_bytes(
-                _sheet(
-                    data,
-                    [
-                        silhouettes.thumbnail(silhouettes.overlay(data.views[index], data.silhouettes))
-                        for index in silhouettes.chosen(len(data.views))
-                    ],
-                )
-            )
+            shown = silhouettes.chosen(len(data.views))
+            cells = [fitted(silhouettes.overlay(data.views[index], data.silhouettes)) for index in shown]
+            (place / SHEET).write_bytes(_sheet(data, cells))
 
     _write_folder(out, fill)
     return _imported(data, out, mesh)
@@ -297,7 +293,7 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
                 picture = silhouettes.overlay(view, data.silhouettes)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
                 (place / CHECK / name).write_bytes(png(picture))
-                thumbnails += [silhouettes.thumbnail(picture)] if index in shown else []
+                thumbnails += [fitted(picture)] if index in shown else []
             (place / SHEET).write_bytes(_sheet(data, thumbnails))
 
     _write_folder(out, fill)
@@ -368,7 +364,8 @@ def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:
     overlaps = [f"IoU {value:.3f}  " for value in data.overlaps] or [""] * len(data.views)
     names = [view.name for view in data.views.bare()]
     labels = [f"{overlaps[index]}{printable(names[index])}" for index in silhouettes.chosen(len(names))]
-    return silhouettes.contact_sheet(thumbnails, labels)
+    rows = [(label, [small]) for label, small in zip(labels, thumbnails, strict=True)]
+    return sheet(rows, [silhouettes.LEGEND], min(8, math.ceil(math.sqrt(len(rows)))))
 
 
 def _imported(data: _Read, out: Path, mesh: Mesh) -> Imported:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, shading_normals
-from unrender.core.text import printable
-from unrender.display.pictures import png, quantized
 from unrender.losses.metrics import srgb
 
 
@@ -80,8 +76,6 @@ _SMALLEST = 320
 _TINT = 0.3
 _CREASE = math.cos(math.radians(50))
 _LARGEST_SHEET = 48
-_CELL = 240
-_LABEL = 14
 
 
 def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
@@ -104,27 +98,6 @@ def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
 def chosen(count: int) -> list[int]:
     """Return the indices of at most 48 evenly spaced pictures for a contact sheet."""
     return np.unique(np.linspace(0, count - 1, min(count, _LARGEST_SHEET)).round().astype(int)).tolist()
-
-
-def thumbnail(picture: np.ndarray) -> Image.Image:
-    """Return a picture with values in [0, 1] as an 8-bit thumbnail."""
-    small = Image.fromarray(quantized(picture))
-    small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
-    return small
-
-
-def contact_sheet(thumbnails: Sequence[Image.Image], labels: Sequence[str]) -> bytes:
-    """Return the pictures with their labels as a PNG file."""
-    columns = min(8, math.ceil(math.sqrt(len(thumbnails))))
-    rows = math.ceil(len(thumbnails) / columns)
-    sheet = Image.new("RGB", (columns * _CELL, rows * (_CELL + _LABEL) + _LABEL), (20, 20, 20))
-    draw = ImageDraw.Draw(sheet)
-    draw.text((3, 1), LEGEND, fill=(220, 220, 220))
-    for place, (small, label) in enumerate(zip(thumbnails, labels, strict=True)):
-        left, top = place % columns * _CELL, place // columns * (_CELL + _LABEL) + _LABEL
-        sheet.paste(small, (left + 2, top + _LABEL))
-        draw.text((left + 3, top + 1), _latin(label), fill=(220, 220, 220))
-    return png(sheet)
 
 
 def _exposure(view: CapturedView) -> float:
@@ -154,7 +127,3 @@ def _creases(normals: np.ndarray, distances: np.ndarray, inside: np.ndarray) -> 
         edges[a] |= both & ((normals[a] * normals[b]).sum(-1) < _CREASE)
         edges[a] |= both & (np.abs(distances[a] - distances[b]) > 0.06)
     return edges
-
-
-def _latin(text: str) -> str:
-    return printable(text).encode("latin-1", "replace").decode("latin-1")[:38]

@@ -112,29 +112,27 @@ def compare_albedo(values: np.ndarray, truth: np.ndarray) -> Albedo:
 
 
 MOST_ROWS = 48
-_CELL, _LABEL, _GAP = 240, 14, 4
+_CELL, _LABEL, _GAP, _LETTERS = 240, 14, 4, 38
+"""Sizes in pixels: width of a cell, height of a label, gaps; letters of a label that fit over a cell."""
 _BACKGROUND, _INK = (20, 20, 20), (220, 220, 220)
 _WIDE = 1024
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], headings: Sequence[str]) -> bytes:
-    """Return a PNG with a row of pictures, (H, W, 3) in [0, 1], for each label; more than four rows form two columns."""
-    groups = 2 if len(rows) > 4 else 1
+def sheet(rows: Sequence[tuple[str, Sequence[Image.Image]]], headings: Sequence[str], groups: int) -> bytes:
+    """Return a PNG of pictures of `fitted`: a row of as many as there are headings for each label, in `groups` columns of rows."""
     count = len(headings)
     lines = -(-len(rows) // groups)
     width = groups * (count * (_CELL + _GAP) + 2 * _GAP)
-    cells = [[_fitted(picture) for picture in pictures] for _, pictures in rows]
-    tall = max(cell.height for line in cells for cell in line)
+    tall = max(cell.height for _, line in rows for cell in line)
     page = Image.new("RGB", (width, _LABEL + _GAP + lines * (tall + _LABEL + _GAP)), _BACKGROUND)
     draw = ImageDraw.Draw(page)
-    for group in range(groups):
-        for column, heading in enumerate(headings):
-            left = group * (width // groups) + column * (_CELL + _GAP)
-            draw.text((left + 3, 1), heading, fill=_INK)
-    for place, ((label, _), line) in enumerate(zip(rows, cells, strict=True)):
+    for column, heading in enumerate([*headings] * (groups if count > 1 else 1)):
+        draw.text((column // count * (width // groups) + column % count * (_CELL + _GAP) + 3, 1), heading, fill=_INK)
+    for place, (label, line) in enumerate(rows):
         top = _LABEL + _GAP + place // groups * (tall + _LABEL + _GAP)
         left = place % groups * (width // groups)
-        draw.text((left + 3, top), printable(label).encode("latin-1", "replace").decode("latin-1"), fill=_INK)
+        text = printable(label).encode("latin-1", "replace").decode("latin-1")[: count * _LETTERS]
+        draw.text((left + 3, top), text, fill=_INK)
         for column, cell in enumerate(line):
             page.paste(cell, (left + column * (_CELL + _GAP), top + _LABEL))
     return png(page)
@@ -147,7 +145,7 @@ def environment_picture(values: np.ndarray) -> bytes:
     return png(picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST))
 
 
-def _fitted(picture: np.ndarray) -> Image.Image:
+def fitted(picture: np.ndarray) -> Image.Image:
     """Resize a picture to the width of a cell; enlarged pixels remain squares."""
     image = Image.fromarray(quantized(picture))
     scale = _CELL / max(image.size)
@@ -202,12 +200,14 @@ def write_pictures(
             box = _box(mask)
             of = measures[index] if measures else None
             ssim = f"  SSIM {of.ssim:.3f}" if of is not None and of.ssim is not None else ""
-            rows.append((name if of is None else f"{name}  {of.psnr:.2f} dB{ssim}", [cell[box] for cell in cells]))
+            rows.append(
+                (name if of is None else f"{name}  {of.psnr:.2f} dB{ssim}", [fitted(cell[box]) for cell in cells])
+            )
         stem = f"{index:04d}-{ready_made.file_name(name)}"
         for kind, cell in zip(kinds, cells, strict=True):
             (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(png(cell))
     last = "under the other light" if relit else f"difference x {_DIFFERENCE}"
-    (folder / SHEET).write_bytes(sheet(rows, ["photograph", "rendering", last]))
+    (folder / SHEET).write_bytes(sheet(rows, ["photograph", "rendering", last], 2 if len(rows) > 4 else 1))
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:
