@@ -23,7 +23,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
-from unrender.gallery import parts, textures, volumes
+from unrender.gallery import parts, volumes
 from unrender.gallery.analytic import RATE
 from unrender.gallery.heights import Lenses, Relief
 from unrender.gallery.rooms import IndirectRoom

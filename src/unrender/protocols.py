@@ -20,7 +20,7 @@ from unrender.estimators.capabilities import (
     Variance,
 )
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
-from unrender.losses.base import Loss
+from unrender.losses.pixelwise import Loss
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, TransformState
 from unrender.parameterisations import Parameterisation, Transform

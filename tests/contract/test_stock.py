@@ -15,7 +15,7 @@ import unrender as ur
 from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate
-from unrender.estimators.stock import StockGradient
+from unrender.estimators.path import StockGradient
 from unrender.methods import method
 
 

@@ -10,7 +10,7 @@ from backends import TEXTURE, problem
 
 import unrender as ur
 from unrender.core.random import Key
-from unrender.losses.base import Loss
+from unrender.losses.pixelwise import Loss
 
 
 def gradients(loss: Loss, tolerance: float, spp: int = 4) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from scipy import stats
 import unrender as ur
 from tiers import quick, slow
 from unrender.backend import cache
-from unrender.gallery import meshes, poses, specification, textures
+from unrender.gallery import meshes, parts, poses, specification
 from unrender.gallery.analytic import QuadraticRenderer
 from unrender.gallery.sunlit import SunlitVase
 from unrender.methods import method
@@ -681,17 +681,17 @@ def test_the_quadratic_knows_its_one_parameter():
 
 @pytest.mark.parametrize("name", ["astronaut", "chelsea", "coffee", "gravel"])
 def test_photographs_are_reflectances(name):
-    picture = textures.photograph(name, 16)
+    picture = parts.photograph(name, 16)
     assert picture.shape == (16, 16, 3)
     assert picture.dtype == np.float32
-    assert textures.DARKEST <= picture.min() < picture.max() <= textures.BRIGHTEST
+    assert parts.DARKEST <= picture.min() < picture.max() <= parts.BRIGHTEST
     # Averaged, not picked: a small picture has the mean of a large one.
-    np.testing.assert_allclose(picture.mean(axis=(0, 1)), textures.photograph(name, 128).mean(axis=(0, 1)), atol=0.01)
+    np.testing.assert_allclose(picture.mean(axis=(0, 1)), parts.photograph(name, 128).mean(axis=(0, 1)), atol=0.01)
 
 
 def test_a_bitmap_keeps_its_values_and_stands_upright():
     values = np.arange(12, dtype=np.float32).reshape(2, 2, 3) / 12
-    texture = mi.load_dict(textures.bitmap(values))
+    texture = mi.load_dict(parts.bitmap(values))
     np.testing.assert_array_equal(np.array(mi.traverse(texture)["data"]), values)
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f([0.01, 0.99], [0.99, 0.01])  # top left, bottom right
@@ -701,7 +701,7 @@ def test_a_bitmap_keeps_its_values_and_stands_upright():
 
 def test_a_repeated_bitmap_is_mirrored():
     values = np.linspace(0, 1, 8, dtype=np.float32)[None, :].repeat(8, 0)
-    texture = mi.load_dict(textures.bitmap(values, repeat=(2, 1)))
+    texture = mi.load_dict(parts.bitmap(values, repeat=(2, 1)))
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f([0.1, 0.4, 0.6, 0.9], 0.5)
     a, b, c, d = np.array(texture.eval(si))[0]

@@ -15,7 +15,7 @@ from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.estimators.capabilities import FreshGradient, NoiseSample
 from unrender.estimators.sample_groups import GradientRequest
-from unrender.gallery import parts, textures
+from unrender.gallery import parts
 from unrender.runs.folder.state import check_alike
 from unrender.scene import batches
 
@@ -33,7 +33,7 @@ def problem(loss: Any = None, sizes: tuple[int, ...] = (12, 12, 12, 12), **more:
         "type": "scene",
         **cameras,
         "wall": parts.rectangle(
-            (0, 0, -1), (2, 0, 0), (0, 2, 0), {"type": "diffuse", "reflectance": textures.bitmap(texels)}
+            (0, 0, -1), (2, 0, 0), (0, 2, 0), {"type": "diffuse", "reflectance": parts.bitmap(texels)}
         ),
         "ball": {
             "type": "sphere",

@@ -7,14 +7,14 @@ import typing
 import numpy as np
 import pytest
 
-from unrender.gallery import textures
+from unrender.gallery import parts
 
 
-@pytest.mark.parametrize("name", typing.get_args(textures.Photograph))
-def test_photographs_are_those_of_scikit_image(name: textures.Photograph) -> None:
+@pytest.mark.parametrize("name", typing.get_args(parts.Photograph))
+def test_photographs_are_those_of_scikit_image(name: parts.Photograph) -> None:
     import skimage.data
 
-    np.testing.assert_array_equal(textures._read(name), getattr(skimage.data, name)())
+    np.testing.assert_array_equal(parts._read(name), getattr(skimage.data, name)())
 
 
 @pytest.mark.parametrize("resolution", [7, 60, 90])
@@ -23,4 +23,4 @@ def test_they_are_resized_as_scikit_image_does(resolution: int) -> None:
 
     picture = np.random.default_rng(0).random((60, 60, 3))
     expected = resize(picture, (resolution, resolution), anti_aliasing=resolution < 60)
-    np.testing.assert_array_equal(textures._resized(picture, resolution), expected)
+    np.testing.assert_array_equal(parts._resized(picture, resolution), expected)

@@ -39,8 +39,8 @@ def test_another_start_is_told_on_the_terminal() -> None:
     """It decides which values a run returns, so the page is not enough."""
     from unrender.app.cli.execute import summarise
     from unrender.display.terminal import Console
-    from unrender.runs.other_start import BEGUN_AGAIN
     from unrender.runs.progress import Progress
+    from unrender.runs.refinement import BEGUN_AGAIN
 
     problem = SimpleNamespace(views=[], unknowns={}, truth={}, parameter_error=lambda _: {})
     lines = [f"{BEGUN_AGAIN} 24 with other values of alpha", "numbers are means of their last steps: alpha 8"]

@@ -11,7 +11,7 @@ import pytest
 import kernels
 from unrender.core import arrays, memory
 from unrender.estimators.gradient_sum import GradientSum
-from unrender.runs.noise import GradientNoise
+from unrender.runs.run import GradientNoise
 
 pytestmark = pytest.mark.mitsuba
 

@@ -12,9 +12,8 @@ from unrender import Parameter, Problem, View, pixels, schedules
 from unrender.core.errors import InputError
 from unrender.estimators.loss_values import LossValues
 from unrender.estimators.meta import MetaEstimator
-from unrender.estimators.path import PathGradient
+from unrender.estimators.path import PathGradient, StockGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
-from unrender.estimators.stock import StockGradient
 from unrender.images import Plain, RecursiveControlVariate
 from unrender.methods.base import method, methods, parse_schedule
 from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG

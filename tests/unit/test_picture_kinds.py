@@ -130,7 +130,7 @@ def test_pictures_are_decoded_in_a_few_modules_alone() -> None:
         "io/image_size.py": {"open"},
         "io/images.py": {"Bitmap", "open"},
         "app/capture/pictures.py": {"open", "imdecode"},
-        "gallery/textures.py": {"open"},
+        "gallery/parts.py": {"open"},
     }
     root = Path(unrender.__file__).parent
     found: dict[str, set[str]] = {}

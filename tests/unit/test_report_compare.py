@@ -12,7 +12,7 @@ from report_folders import KEY, Page, write_run
 
 from unrender.app import report
 from unrender.app.report import curves, groups, panels, tables
-from unrender.app.sweeps.trials import stated_error
+from unrender.app.sweeps.record import stated_error
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 from unrender.runs.folder.reader import ViewPictures, read

@@ -10,7 +10,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.runs import loop
-from unrender.runs.noise import GradientNoise
+from unrender.runs.run import GradientNoise
 
 
 def data(shape: tuple[int, ...]) -> np.ndarray:

@@ -14,16 +14,18 @@ import pytest
 from unrender.app.cli.sweep_driver import equally_good, run_command
 from unrender.app.sweeps.record import (
     RunOutcome,
+    Started,
     SweepPlan,
     SweepRecord,
     TrialRecord,
+    Trials,
     best_folders,
     read_sweep,
+    trial_record,
     watched_folders,
     write_sweep,
 )
 from unrender.app.sweeps.search import Axis, Grid, Random, Search, parse_axes
-from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.core.errors import InputError
 from unrender.methods import method
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from unrender.app.distributed.cluster.connection import check_cluster, check_token
-from unrender.backend.access import can_change, can_read
+from unrender.backend.cache import can_change, can_read
 from unrender.core.errors import InputError
 
 

@@ -66,7 +66,7 @@ def _kind(name: str, package: str, protocol: str, *members: str, in_tables: bool
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        _kind("loss", "unrender.losses", "unrender.losses.base.Loss", "value derivative"),
+        _kind("loss", "unrender.losses", "unrender.losses.pixelwise.Loss", "value derivative"),
         _kind("schedule", "unrender.schedules", "unrender.schedules.Schedule", "__call__"),
         _kind("parameterisation", "unrender.parameterisations", "unrender.parameterisations.Parameterisation", "transform"),
         _kind("preconditioner", "unrender.preconditioners", "unrender.preconditioners.base.Preconditioner", "check apply"),

@@ -9,9 +9,8 @@ if TYPE_CHECKING:
     from unrender.estimators.hybrid import HybridGradient
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
-    from unrender.estimators.path import PathGradient
+    from unrender.estimators.path import PathGradient, StockGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
-    from unrender.estimators.stock import StockGradient
 
 __getattr__, _ = lazy.attach(
     __name__,

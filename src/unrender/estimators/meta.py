@@ -17,8 +17,8 @@ from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
 from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
 from unrender.images.plain import Plain
-from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
+from unrender.pixels.uniform import All
 from unrender.rendering.renderer import Space
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, upsampled

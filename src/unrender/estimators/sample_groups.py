@@ -23,8 +23,8 @@ from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, lea
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
+from unrender.pixels.uniform import All
 from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
 from unrender.scene.batches import (
     Frame,

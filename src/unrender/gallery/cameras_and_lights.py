@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.scene.parameter import Parameter
 
 _PLACES = {"left": (-1.95, 1.36, 1.95), "middle": (0.15, 1.89, 2.55), "right": (2.18, 1.06, 1.5)}
@@ -36,8 +36,8 @@ class Camera(fields.Rendered):
 
     def scene(self) -> dict[str, Any]:
         """Return objects of several heights on a patterned floor, before a patterned wall, under two suns."""
-        floor = {"type": "diffuse", "reflectance": textures.bitmap(_pattern(3.0, 0.7))}
-        wall = {"type": "diffuse", "reflectance": textures.bitmap(_pattern(4.0, 2.1))}
+        floor = {"type": "diffuse", "reflectance": parts.bitmap(_pattern(3.0, 0.7))}
+        wall = {"type": "diffuse", "reflectance": parts.bitmap(_pattern(4.0, 2.1))}
         return {
             "type": "scene",
             **{name: parts.camera(place, _TARGET, 54.0, self.resolution) for name, place in _PLACES.items()},
@@ -68,7 +68,7 @@ class Camera(fields.Rendered):
 
 def _pattern(frequency: float, phase: float) -> np.ndarray:
     """Return smooth stripes and spots of three colours, (64, 64, 3)."""
-    x, y = textures.grid(64)
+    x, y = parts.grid(64)
     first = 0.5 + 0.5 * np.sin(2 * np.pi * (frequency * x + 0.7 * np.sin(5 * y)) + phase)
     second = 0.5 + 0.5 * np.sin(2 * np.pi * frequency * 0.8 * y + 3 * x + phase)
     return (0.12 + 0.6 * np.stack([first, 0.5 * (first + second), second], -1)).astype(np.float32)
@@ -106,7 +106,7 @@ class StageLights(fields.Rendered):
         """Return the stage: x in [-2, 2], z in [-1.5, 2], a backdrop at z = -1.5, two blocks, and the camera at its front, looking along
         -z."""
         place = mi.ScalarTransform4f
-        picture = textures.bitmap(textures.photograph("coffee", 8))
+        picture = parts.bitmap(parts.photograph("coffee", 8))
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.6, 5.0), (0, 0.6, -0.5), 42.0, self.resolution),

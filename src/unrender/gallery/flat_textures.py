@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -42,9 +42,9 @@ class Poster(fields.Rendered):
 
     def scene(self) -> dict[str, Any]:
         """Return the poster, x and y in [-1, 1] at z = 0, filling the image, with the lamp before it, above the field of view."""
-        picture = textures.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True)
+        picture = parts.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True)
         # Texels are squares. With interpolation, no image would distinguish the finest pattern from its mean grey.
-        texels = textures.bitmap(picture.astype(np.float32)) | {"filter_type": "nearest"}
+        texels = parts.bitmap(picture.astype(np.float32)) | {"filter_type": "nearest"}
         paint = {"type": "diffuse", "reflectance": texels}
         down = np.array([0.0, -0.6, -0.8])
         return {
@@ -83,7 +83,7 @@ class Caustic(fields.Rendered):
 
         The lamps' tubes extend upwards from the balls' equators, out of view.
         """
-        tiles = {"type": "diffuse", "reflectance": textures.bitmap(_mosaic(self.texture_resolution))}
+        tiles = {"type": "diffuse", "reflectance": parts.bitmap(_mosaic(self.texture_resolution))}
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.8, 2.5), (0, 0.3, 0.0), 46.0, self.resolution),
@@ -132,7 +132,7 @@ def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any
 
 def _mosaic(resolution: int) -> np.ndarray:
     """Return rings of light and dark tiles in four colours, (resolution, resolution, 3)."""
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     colours = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
     x, y = np.floor(8 * u) - 3.5, np.floor(8 * v) - 3.5
     tile = colours[(np.maximum(np.abs(x), np.abs(y)) + 2 * (np.abs(x) == np.abs(y))).astype(int) % 4]

@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
@@ -108,26 +108,26 @@ def _ball_frame(centre: parts.Vector, radius: float) -> Any:
 
 
 def _tile_material(resolution: int) -> dict[str, Any]:
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     rings = 0.5 + 0.5 * np.cos(22 * np.hypot(u - 0.5, v - 0.5))
     return {
         "type": "principled",
         "metallic": 1.0,
-        "base_color": textures.bitmap(textures.photograph("chelsea", resolution)),
-        "roughness": textures.bitmap(0.2 + 0.4 * rings),
+        "base_color": parts.bitmap(parts.photograph("chelsea", resolution)),
+        "roughness": parts.bitmap(0.2 + 0.4 * rings),
     }
 
 
 def _ball_material(resolution: int) -> dict[str, Any]:
-    u, v = textures.grid(resolution)
-    dots = 1 - textures.ramp(np.hypot((4 * u) % 1 - 0.5, (3 * v) % 1 - 0.5), 0.25, 0.35)
-    stripes = textures.ramp(np.sin(4 * np.pi * (u - v)), -0.5, 0.5)
+    u, v = parts.grid(resolution)
+    dots = 1 - parts.ramp(np.hypot((4 * u) % 1 - 0.5, (3 * v) % 1 - 0.5), 0.25, 0.35)
+    stripes = parts.ramp(np.sin(4 * np.pi * (u - v)), -0.5, 0.5)
     repeat = (2, 1.5)  # one copy on the side that the cameras see, ending a little below the equator
     return {
         "type": "principled",
         "base_color": parts.colour(0.85, 0.55, 0.2),
-        "metallic": textures.bitmap(0.25 + 0.7 * dots, repeat),
-        "roughness": textures.bitmap(0.2 + 0.4 * stripes, repeat),
+        "metallic": parts.bitmap(0.25 + 0.7 * dots, repeat),
+        "roughness": parts.bitmap(0.2 + 0.4 * stripes, repeat),
     }
 
 
@@ -194,14 +194,14 @@ def _chalice_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _silver(resolution: int) -> dict[str, Any]:
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     worn = 0.5 + 0.5 * np.sin(2 * np.pi * (6 * u + 2 * np.sin(2 * np.pi * v))) * np.cos(2 * np.pi * 3 * v)
     return parts.twosided(
         {
             "type": "principled",
             "base_color": parts.colour(0.85, 0.82, 0.75),
             "metallic": 1.0,
-            "roughness": textures.bitmap(0.2 + 0.45 * worn),
+            "roughness": parts.bitmap(0.2 + 0.45 * worn),
         }
     )
 
@@ -319,11 +319,11 @@ def _lacquer(resolution: int) -> dict[str, Any]:
     if resolution == 1:
         unknown: dict[str, Any] = {"base_color": parts.colour(*copper), "metallic": 0.8, "roughness": 0.3}
     else:
-        u, v = textures.grid(resolution)
-        bands = textures.ramp(np.sin(6 * np.pi * u), -0.4, 0.4)[..., None]
+        u, v = parts.grid(resolution)
+        bands = parts.ramp(np.sin(6 * np.pi * u), -0.4, 0.4)[..., None]
         unknown = {
-            "base_color": textures.bitmap(blue + (copper - blue) * bands),
-            "metallic": textures.bitmap(0.1 + 0.8 * textures.ramp(np.cos(4 * np.pi * u), -0.5, 0.5)),
-            "roughness": textures.bitmap(0.2 + 0.45 * v),
+            "base_color": parts.bitmap(blue + (copper - blue) * bands),
+            "metallic": parts.bitmap(0.1 + 0.8 * parts.ramp(np.cos(4 * np.pi * u), -0.5, 0.5)),
+            "roughness": parts.bitmap(0.2 + 0.45 * v),
         }
     return parts.twosided({"type": "principled", **unknown})

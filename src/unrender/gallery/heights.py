@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.gallery.specification import reference
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
@@ -181,5 +181,5 @@ def _heights(count: int) -> np.ndarray:
     radius = np.hypot(x, y)
     ring = 0.12 * np.exp(-(((radius - 0.6) / 0.12) ** 2))
     dome = 0.16 * np.exp(-((radius / 0.25) ** 2))
-    groove = -0.08 * np.exp(-(((x - y) / 0.18) ** 2)) * textures.ramp(1.0 - radius, 0.0, 0.3)
+    groove = -0.08 * np.exp(-(((x - y) / 0.18) ** 2)) * parts.ramp(1.0 - radius, 0.0, 0.3)
     return ring + dome + groove

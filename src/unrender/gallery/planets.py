@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -67,7 +67,7 @@ class TwoPlanets(fields.Rendered):
 
 def _ball(name: str, x: float, texture: np.ndarray) -> Any:
     points = meshes.ellipsoid(_PLANET * np.eye(3), np.array([x, 0.0, 0.0]), 48, 96)
-    return meshes.sheet(name, points, {"type": "diffuse", "reflectance": textures.bitmap(texture)}, closed=True)
+    return meshes.sheet(name, points, {"type": "diffuse", "reflectance": parts.bitmap(texture)}, closed=True)
 
 
 def sky() -> dict[str, Any]:
@@ -88,34 +88,34 @@ def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[
 def blue(resolution: int) -> np.ndarray:
     """Return oceans, green to brown continents, polar ice and clouds: (resolution, resolution, 3) float32, v = 1 first."""
     x, land = _directions(resolution), _noise(resolution, 3, (1.6, 3.2, 6.0))
-    cloud = textures.ramp(_noise(resolution, 8, (2.5, 5.0, 7.0)), 0.35, 1.0)
+    cloud = parts.ramp(_noise(resolution, 8, (2.5, 5.0, 7.0)), 0.35, 1.0)
     deep, shelf, green, brown, ice = (
         np.array(c) for c in ([0.05, 0.1, 0.4], [0.08, 0.3, 0.5], [0.12, 0.35, 0.08], [0.5, 0.36, 0.18], [0.85] * 3)
     )
-    sea = textures.mix(deep, shelf, textures.ramp(land, -0.5, 0.1))
-    ground = textures.mix(green, brown, textures.ramp(land, 0.25, 0.9))
-    surface = textures.mix(sea, ground, textures.ramp(land, 0.08, 0.2))
-    surface = textures.mix(surface, ice, textures.ramp(np.abs(x[..., 1]) + 0.06 * land, 0.8, 0.88))
-    return textures.mix(surface, np.array([0.85] * 3), 0.8 * cloud).astype(np.float32)
+    sea = parts.mix(deep, shelf, parts.ramp(land, -0.5, 0.1))
+    ground = parts.mix(green, brown, parts.ramp(land, 0.25, 0.9))
+    surface = parts.mix(sea, ground, parts.ramp(land, 0.08, 0.2))
+    surface = parts.mix(surface, ice, parts.ramp(np.abs(x[..., 1]) + 0.06 * land, 0.8, 0.88))
+    return parts.mix(surface, np.array([0.85] * 3), 0.8 * cloud).astype(np.float32)
 
 
 def red(resolution: int) -> np.ndarray:
     """Return rust with dark plains, craters and one white pole: (resolution, resolution, 3) float32, v = 1 first."""
     x, rough = _directions(resolution), _noise(resolution, 21, (2.0, 4.0, 8.0))
     dust, rust, dark, ice = (np.array(c) for c in ([0.75, 0.42, 0.2], [0.55, 0.2, 0.08], [0.2, 0.08, 0.06], [0.85] * 3))
-    surface = textures.mix(rust, dust, textures.ramp(rough, -0.6, 0.8))
-    surface = textures.mix(surface, dark, textures.ramp(_noise(resolution, 34, (1.5, 3.0)), 0.2, 0.7))
+    surface = parts.mix(rust, dust, parts.ramp(rough, -0.6, 0.8))
+    surface = parts.mix(surface, dark, parts.ramp(_noise(resolution, 34, (1.5, 3.0)), 0.2, 0.7))
     rng = np.random.default_rng(55)
     for centre in rng.normal(size=(14, 3)):
         distance = np.arccos(np.clip(x @ parts.unit(centre), -1, 1)) / rng.uniform(0.12, 0.3)
-        surface = textures.mix(surface, dust, 0.8 * np.exp(-(((distance - 1) / 0.25) ** 2)))
-        surface = textures.mix(surface, dark, 0.7 * (1 - textures.ramp(distance, 0.6, 0.95)))
-    return textures.mix(surface, ice, textures.ramp(x[..., 1] + 0.05 * rough, 0.82, 0.9)).astype(np.float32)
+        surface = parts.mix(surface, dust, 0.8 * np.exp(-(((distance - 1) / 0.25) ** 2)))
+        surface = parts.mix(surface, dark, 0.7 * (1 - parts.ramp(distance, 0.6, 0.95)))
+    return parts.mix(surface, ice, parts.ramp(x[..., 1] + 0.05 * rough, 0.82, 0.9)).astype(np.float32)
 
 
 def _directions(resolution: int) -> np.ndarray:
     """Return each texel's position on the unit sphere, (resolution, resolution, 3), with the north pole's row first."""
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     longitude, latitude = 2 * np.pi * (u - 0.5), np.pi * (0.5 - v)
     return np.stack(
         [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], axis=-1
@@ -155,7 +155,7 @@ class GlobeAndMirror(fields.Rendered):
         centre."""
         right, up = parts.facing(parts.unit(_EYE - _MIRROR) + parts.unit(-_MIRROR))
         globe = meshes.ellipsoid(_PLANET * np.eye(3), np.zeros(3), 48, 96)
-        paint = {"type": "diffuse", "reflectance": textures.bitmap(blue(self.texture_resolution))}
+        paint = {"type": "diffuse", "reflectance": parts.bitmap(blue(self.texture_resolution))}
         return {
             "type": "scene",
             "camera": parts.camera(_EYE, (-0.7, 0.0, -0.2), 34.0, self.resolution),
@@ -197,7 +197,7 @@ class ThreeTextures(fields.Rendered):
         rows, columns = 48, 96
         ball = meshes.ellipsoid(0.45 * np.eye(3), np.array([0.0, 0.45, 0.0]), rows, columns)
         jar, cone = meshes.lathe(*_jar(rows), columns), meshes.lathe(*_cone(rows), columns)
-        planet = textures.bitmap(blue(self.texture_resolution))
+        planet = parts.bitmap(blue(self.texture_resolution))
         return {
             "type": "scene",
             **parts.cameras_around(angles, 4.4, (2.2,), (0, 0.4, 0), 32.0, self.resolution),
@@ -215,9 +215,9 @@ class ThreeTextures(fields.Rendered):
             for name in ("ball", "jar", "cone")
         )
 
-    def _photograph(self, name: textures.Photograph) -> dict[str, Any]:
+    def _photograph(self, name: parts.Photograph) -> dict[str, Any]:
         """Return an upright photograph, once on either half of the circumference, mirrored."""
-        return textures.bitmap(textures.photograph(name, self.texture_resolution)[::-1], repeat=(2, 1))
+        return parts.bitmap(parts.photograph(name, self.texture_resolution)[::-1], repeat=(2, 1))
 
 
 def _painted(name: str, points: np.ndarray, texture: dict[str, Any]) -> Any:

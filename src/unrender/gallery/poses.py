@@ -18,7 +18,7 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.core.rotations import rotation
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.scene.parameter import Parameter
 
 _SUN = np.array([0.4, 1.0, -0.25])
@@ -186,11 +186,11 @@ def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, 
     to = mi.ScalarTransform4f
     inside = to().scale([1 / width, 1 / (top - bottom), 1]) @ to().translate([-left, -bottom, 0])
     upright = to().translate([0, 1, 0]) @ to().scale([1, -1, 1])
-    picture = textures.bitmap(textures.photograph("coffee", texels)) | {"to_uv": upright @ inside}
+    picture = parts.bitmap(parts.photograph("coffee", texels)) | {"to_uv": upright @ inside}
     ninth = to().translate([1 / 3, 1 / 3, 0]) @ to().scale([1 / 3, 1 / 3, 1])
     middle = np.zeros((3, 3), np.float32)
     middle[1, 1] = 1.0
-    weight = textures.bitmap(middle) | {"filter_type": "nearest", "to_uv": ninth @ inside}
+    weight = parts.bitmap(middle) | {"filter_type": "nearest", "to_uv": ninth @ inside}
     return {"type": "blendbsdf", "weight": weight, "glaze": glaze, "label": {"type": "diffuse", "reflectance": picture}}
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.core.rotations import rotation
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.losses import L1, Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
@@ -45,7 +45,7 @@ class IndirectRoom(fields.Rendered):
 
     def scene(self) -> dict[str, Any]:
         """Return the room: x and y in [-1, 1], z in [-1, 2.2], with the camera inside, looking along -z."""
-        picture = textures.bitmap(textures.photograph("astronaut", self.texture_resolution))
+        picture = parts.bitmap(parts.photograph("astronaut", self.texture_resolution))
         room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
         return {
             "type": "scene",
@@ -105,7 +105,7 @@ class Lamp(fields.Rendered):
     def scene(self) -> dict[str, Any]:
         """Return the room: x in [-1.6, 1.6], y in [0, 2.2], z in [-1.2, 2.6], with the camera at its front, looking along -z."""
         plaster = parts.diffuse(0.7)
-        mural = textures.bitmap(textures.photograph("coffee", self.texture_resolution))
+        mural = parts.bitmap(parts.photograph("coffee", self.texture_resolution))
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.05, 2.5), (0, 1.05, -1.2), 47.0, self.resolution),
@@ -166,8 +166,8 @@ class Ajar(fields.Rendered):
         """Return the room: x in [-1.5, 1.5], y in [0, 2], z in [-1, 2]; the corridor is at x < -1.5; the camera looks along -z."""
         grey, white = parts.diffuse(0.5), parts.twosided(parts.diffuse(0.7))
         size = self.texture_resolution
-        wall = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("coffee", size))}
-        clay = {"type": "diffuse", "reflectance": textures.bitmap(_glaze(size))}
+        wall = {"type": "diffuse", "reflectance": parts.bitmap(parts.photograph("coffee", size))}
+        clay = {"type": "diffuse", "reflectance": parts.bitmap(_glaze(size))}
         return {
             "type": "scene",
             "camera": parts.camera((0.25, 0.95, 1.95), (0.1, 0.8, -1), 58.0, self.resolution),
@@ -229,16 +229,16 @@ def _corridor(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 def _pot_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
     t = np.linspace(0, 1, rows)
-    return 0.2 + 0.1 * t + 0.035 * textures.ramp(t, 0.78, 0.82), 0.42 * t
+    return 0.2 + 0.1 * t + 0.035 * parts.ramp(t, 0.78, 0.82), 0.42 * t
 
 
 def _glaze(resolution: int) -> np.ndarray:
     """Return terracotta with a cream zigzag and a blue rim."""
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     clay, cream, blue = np.array([0.6, 0.24, 0.12]), np.array([0.85, 0.78, 0.6]), np.array([0.1, 0.2, 0.5])
     zigzag = np.abs(v - 0.55 - 0.15 * np.abs(((8 * u) % 1) - 0.5) * 2)
-    painted = clay + (cream - clay) * (1 - textures.ramp(zigzag, 0.06, 0.12))[..., None]
-    return painted + (blue - painted) * (1 - textures.ramp(v, 0.1, 0.16))[..., None]
+    painted = clay + (cream - clay) * (1 - parts.ramp(zigzag, 0.06, 0.12))[..., None]
+    return painted + (blue - painted) * (1 - parts.ramp(v, 0.1, 0.16))[..., None]
 
 
 def _rosette(rows: int, columns: int) -> np.ndarray:
@@ -253,10 +253,10 @@ def _rosette(rows: int, columns: int) -> np.ndarray:
 
 
 def _leaf(resolution: int) -> dict[str, Any]:
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     veins = np.abs(np.sin(np.pi * (_LEAVES * u + 3 * v)))[..., None] ** 0.5
     young, old = np.array([0.5, 0.65, 0.35]), np.array([0.05, 0.22, 0.06])
-    return parts.twosided({"type": "diffuse", "reflectance": textures.bitmap(young + (old - young) * veins)})
+    return parts.twosided({"type": "diffuse", "reflectance": parts.bitmap(young + (old - young) * veins)})
 
 
 @register(name="plain-and-textured", position=10)
@@ -276,7 +276,7 @@ class PlainAndTextured(fields.Rendered):
         """Return the room of `parts.room` with a lamp in its ceiling, and bin and cushion on its floor y = -1."""
         cover = {
             "type": "diffuse",
-            "reflectance": textures.bitmap(textures.photograph("chelsea", self.texture_resolution)),
+            "reflectance": parts.bitmap(parts.photograph("chelsea", self.texture_resolution)),
         }
         place = np.array([-0.46, -1.0, -0.3])
         return {
@@ -302,7 +302,7 @@ class PlainAndTextured(fields.Rendered):
 def _bin(rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Return radius and height of a bin with a rim, open at the top, without a visible bottom."""
     t = np.linspace(0, 1, rows)
-    return 0.26 + 0.1 * t + 0.03 * textures.ramp(t, 0.9, 0.94), 0.85 * t
+    return 0.26 + 0.1 * t + 0.03 * parts.ramp(t, 0.9, 0.94), 0.85 * t
 
 
 def _cushion(steps: int) -> np.ndarray:

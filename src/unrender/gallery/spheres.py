@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.gallery.specification import reconstruction
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.picture_format import AOVS
@@ -79,7 +79,7 @@ def _clay() -> dict[str, Any]:
 def _body(directions: np.ndarray) -> np.ndarray:
     """Return a pear with a bent neck and a dent in its side, from unit directions: (V, 3)."""
     x, y, z = directions.T
-    neck = textures.ramp(y, -0.1, 0.9)
+    neck = parts.ramp(y, -0.1, 0.9)
     width = 0.78 - 0.42 * neck - 0.18 * np.exp(-((x - 0.9) ** 2 + (y + 0.2) ** 2 + z**2) / 0.12)
     return np.stack([width * x + 0.3 * neck**2, 0.9 * y - 0.05, width * z - 0.1 * neck**2], -1)
 
@@ -285,7 +285,7 @@ class Statue(fields.Rendered):
 def _statue(place: Any, subdivisions: int, texture: np.ndarray) -> Any:
     directions, faces = meshes.icosphere(subdivisions)
     of, faces, coordinates = meshes.unrolled(directions, faces)
-    stone = parts.twosided({"type": "diffuse", "reflectance": textures.bitmap(texture) | {"wrap_mode": "repeat"}})
+    stone = parts.twosided({"type": "diffuse", "reflectance": parts.bitmap(texture) | {"wrap_mode": "repeat"}})
     return meshes.triangles("statue", place(directions[of]), faces, stone, coordinates)
 
 
@@ -296,12 +296,12 @@ def _bust(directions: np.ndarray) -> np.ndarray:
     x, y, z = directions.T
     height = np.arcsin(np.clip(y, -1, 1)) / (np.pi / 2)
     radius = PchipInterpolator(*np.transpose(_PROFILE))(height)
-    shoulders = textures.ramp(-height, 0.0, 0.3)
+    shoulders = parts.ramp(-height, 0.0, 0.3)
     level = np.maximum(np.sqrt(np.maximum(1 - y * y, 0)), 1e-9)
     across, along = radius * x / level, radius * z / level
     nose = 0.14 * np.exp(-((x / 0.2) ** 2) - ((height - 0.38) / 0.09) ** 2) * (z > 0)
     return np.stack(
-        [across, 0.95 * height, along * (1 - 0.42 * shoulders) + nose + 0.1 * textures.ramp(height, 0.0, 0.3)], -1
+        [across, 0.95 * height, along * (1 - 0.42 * shoulders) + nose + 0.1 * parts.ramp(height, 0.0, 0.3)], -1
     )
 
 
@@ -310,7 +310,7 @@ def _stone(rows: int) -> np.ndarray:
     u, v = np.meshgrid((np.arange(2 * rows) + 0.5) / (2 * rows), (np.arange(rows) + 0.5) / rows)
     around = 2 * np.pi * u
     veins = 0.5 + 0.5 * np.sin(3 * around + 9 * v + 1.5 * np.sin(2 * around + 14 * v))
-    bands = textures.ramp(np.sin(2 * np.pi * 3.5 * v + np.sin(around)), -0.4, 0.4)
+    bands = parts.ramp(np.sin(2 * np.pi * 3.5 * v + np.sin(around)), -0.4, 0.4)
     warm, cold, dark = (np.array(c) for c in ((0.75, 0.55, 0.35), (0.35, 0.45, 0.6), (0.2, 0.14, 0.12)))
     mixed = warm + bands[..., None] * (cold - warm)
     return (mixed + 0.6 * veins[..., None] ** 4 * (dark - mixed)).astype(np.float32)

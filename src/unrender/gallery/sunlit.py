@@ -20,7 +20,7 @@ from unrender.backend import variant
 from unrender.core import checks
 from unrender.core.registry import register
 from unrender.core.rotations import MITSUBA_TO_OPENGL
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts
 from unrender.io import files
 from unrender.losses import L1, Loss
 from unrender.preconditioners import LargeSteps
@@ -49,7 +49,7 @@ class SunlitVase(fields.Rendered):
     def scene(self) -> dict[str, Any]:
         """Return the vase, 1.7 high, on the ground y = 0 around the y axis."""
         angles = np.pi / 6 + 2 * np.pi * np.arange(self.views) / self.views
-        gravel = textures.bitmap(textures.photograph("gravel", 128), repeat=(10, 10))
+        gravel = parts.bitmap(parts.photograph("gravel", 128), repeat=(10, 10))
         return {
             "type": "scene",
             **parts.cameras_around(angles, 4.2, (1.9,), (0, 0.82, 0), 28.0, self.resolution),
@@ -64,7 +64,7 @@ class SunlitVase(fields.Rendered):
 
 def vase(texture_resolution: int) -> dict[str, Any]:
     """Return the vase with its true glaze."""
-    paint = textures.bitmap(_painting(texture_resolution))
+    paint = parts.bitmap(_painting(texture_resolution))
     glaze = parts.twosided({"type": "principled", "base_color": paint, "roughness": 0.35, "specular": 0.5})
     return meshes.sheet("vase", _vase_points(96, 96), glaze, closed=True)
 
@@ -97,7 +97,7 @@ def _vase_points(rows: int, columns: int) -> np.ndarray:
 
 def _painting(resolution: int) -> np.ndarray:
     """Return bands, a zigzag, dots and petals on terracotta, seamless in u: (resolution, resolution, 3), v = 1 first."""
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     v = 1 - v
     clay, ink, cream, blue = (
         np.array(c) for c in ([0.6, 0.22, 0.1], [0.05, 0.05, 0.07], [0.85, 0.75, 0.55], [0.08, 0.25, 0.6])
@@ -105,7 +105,7 @@ def _painting(resolution: int) -> np.ndarray:
 
     def within(x: np.ndarray, low: float, high: float | np.ndarray) -> np.ndarray:
         edge = 0.012
-        return textures.ramp(x, low - edge, low + edge) * (1 - textures.ramp(x, high - edge, high + edge))
+        return parts.ramp(x, low - edge, low + edge) * (1 - parts.ramp(x, high - edge, high + edge))
 
     saw = np.abs((8 * u) % 1 - 0.5) * 2
     petals = np.sqrt(np.abs(np.sin(6 * np.pi * u)))
@@ -116,7 +116,7 @@ def _painting(resolution: int) -> np.ndarray:
         (within(v, 0.12, 0.125 + 0.19 * petals), blue),
         (within(v, 0.38, 0.58), ink),
         (within(v - 0.08 * saw, 0.41, 0.475), cream),
-        (1 - textures.ramp(dots, 0.025, 0.045), cream),
+        (1 - parts.ramp(dots, 0.025, 0.045), cream),
         (within(v, 0.72, 0.74), ink),
         (within(v, 0.8, 0.9), blue),
         (within(v, 0.94, 1.1), ink),
@@ -208,7 +208,7 @@ class SunGlossy(fields.Rendered):
         angles = 0.35 + 2 * np.pi * np.arange(self.views) / self.views
         lacquer = {
             "type": "roughplastic",
-            "diffuse_reflectance": textures.bitmap(_doll_painting(self.texture_resolution)),
+            "diffuse_reflectance": parts.bitmap(_doll_painting(self.texture_resolution)),
             "alpha": 0.05,
         }
         return {
@@ -238,20 +238,20 @@ def _doll_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _doll_painting(resolution: int) -> np.ndarray:
     """Return a face in a scarf, an apron with flowers and a skirt with dots, seamless in u: (resolution, resolution, 3), v = 1 first."""
-    u, v = textures.grid(resolution)
+    u, v = parts.grid(resolution)
     v = 1 - v**1.5  # height, as the profile's rows have it
     skirt, scarf, skin, white = ([0.65, 0.06, 0.05], [0.85, 0.5, 0.06], [0.85, 0.62, 0.45], [0.85, 0.83, 0.75])
     black, leaf, blue, pink = [0.05, 0.04, 0.04], [0.08, 0.35, 0.1], [0.06, 0.15, 0.5], [0.85, 0.25, 0.3]
 
     def spot(u0: float, v0: float, radius: float, stretch: float = 1.6) -> np.ndarray:
         distance = np.hypot((u - u0) * stretch, v - v0)
-        return 1 - textures.ramp(distance, radius - 0.012, radius + 0.012)
+        return 1 - parts.ramp(distance, radius - 0.012, radius + 0.012)
 
     def band(low: float, high: float) -> np.ndarray:
-        return textures.ramp(v, low - 0.012, low + 0.012) * (1 - textures.ramp(v, high - 0.012, high + 0.012))
+        return parts.ramp(v, low - 0.012, low + 0.012) * (1 - parts.ramp(v, high - 0.012, high + 0.012))
 
     lattice = np.hypot(((12 * u) % 1 - 0.5) / 12 * 1.8, (v * 8 % 1 - 0.5) / 8)
-    dots = 1 - textures.ramp(lattice, 0.025, 0.045)
+    dots = 1 - parts.ramp(lattice, 0.025, 0.045)
     petals = sum(spot(0.5 + 0.055 * np.cos(a), 0.32 + 0.085 * np.sin(a), 0.055) for a in 2 * np.pi * np.arange(5) / 5)
     layers = [
         (dots * band(0.0, 0.58), scarf),
@@ -275,5 +275,5 @@ def _layered(ground: Any, layers: list[tuple[Any, Any]]) -> np.ndarray:
     """Return the ground under layers of paint, (H, W, 3) float32, each with its coverage (H, W)."""
     picture = np.asarray(ground)
     for cover, paint in layers:
-        picture = textures.mix(picture, np.asarray(paint), np.clip(cover, 0, 1))
+        picture = parts.mix(picture, np.asarray(paint), np.clip(cover, 0, 1))
     return picture.astype(np.float32)

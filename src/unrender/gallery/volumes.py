@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, parts, textures
+from unrender.gallery import fields, parts
 from unrender.gallery.specification import reconstruction
 from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
@@ -126,10 +126,10 @@ def _smoke(resolution: int) -> tuple[np.ndarray, np.ndarray]:
     x, y, z = positions(resolution)
     lean = 0.25 * np.sin(2 * y)
     radius = np.hypot(x - lean, z) / (0.55 + 0.25 * y)
-    plume = textures.ramp(1.1 - radius, 0, 0.5) * textures.ramp(0.95 - np.abs(y), 0, 0.3)
-    billows = textures.ramp(noise(resolution, 4, seed=1), 0.35, 0.75)
+    plume = parts.ramp(1.1 - radius, 0, 0.5) * parts.ramp(0.95 - np.abs(y), 0, 0.3)
+    billows = parts.ramp(noise(resolution, 4, seed=1), 0.35, 0.75)
     density = 6 * plume * billows
-    mix = textures.ramp(y + 0.6 * (noise(resolution, 2, seed=2) - 0.5), -0.6, 0.6)[..., None]
+    mix = parts.ramp(y + 0.6 * (noise(resolution, 2, seed=2) - 0.5), -0.6, 0.6)[..., None]
     colour = np.array([0.9, 0.7, 0.45]) * (1 - mix) + np.array([0.5, 0.7, 0.92]) * mix
     return density[..., None].astype(np.float32), colour.astype(np.float32)
 

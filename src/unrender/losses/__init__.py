@@ -9,9 +9,8 @@ reference where the mask is 0: mean of ℓ(R + mask · (I − R), R). Any functi
 """
 
 from unrender.losses import metrics as metrics
-from unrender.losses.base import Loss
 from unrender.losses.function import FunctionLoss
 from unrender.losses.perceptual import Perceptual
-from unrender.losses.pixelwise import L1, L2, Censored, Huber, RelativeL2
+from unrender.losses.pixelwise import L1, L2, Censored, Huber, Loss, RelativeL2
 
 __all__ = ["L1", "L2", "Censored", "FunctionLoss", "Huber", "Loss", "Perceptual", "RelativeL2"]

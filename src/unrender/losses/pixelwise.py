@@ -1,8 +1,9 @@
-"""Pixelwise losses, and one for photographs with saturated pixels, whose true radiance is at least white."""
+"""The protocol of losses; pixelwise losses, and one for photographs with saturated pixels, whose true radiance is at least white."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.losses.base import Loss
 
 _CLEARLY = 4.0
 """Standard errors by which images are darker than a lower bound that they do not reach."""
@@ -156,3 +156,30 @@ def determined_pixels(loss: Loss, reference: np.ndarray, images: np.ndarray | No
     dark, squares = bounds & (below < 0.0).any(axis=0), below.var(axis=0, ddof=1) / len(below)
     noise = np.sqrt(np.maximum(squares, squares[dark].mean() if dark.any() else 0.0))
     return np.asarray(~(bounds & ~(below.mean(axis=0) < -_CLEARLY * noise)).any(axis=-1))
+
+
+@runtime_checkable
+class Loss(Protocol):
+    """Distance of an image to its reference per element. Both arrays have the same shape and contain linear radiance."""
+
+    @property
+    def linear(self) -> bool:
+        """Return whether `derivative` is linear (affine) in the image, so that image noise does not bias the gradient."""
+        ...
+
+    @property
+    def pixelwise(self) -> bool:
+        """Return whether the loss of an element depends on that element alone, so that it can be evaluated for some pixels.
+
+        A loss of full images (..., H, W, 3) returns an image's loss in each of its elements, so that their mean is the loss, and scales
+        its derivative accordingly.
+        """
+        ...
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """Return ℓ(I, R) per element, with the shape of the image; >= 0 for all losses but a user's function."""
+        ...
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """Return ∂ℓ/∂I per element, with the shape of the image."""
+        ...

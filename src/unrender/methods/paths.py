@@ -10,8 +10,7 @@ from unrender import pixels
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.emitter_selection import EmitterSelection
-from unrender.estimators.path import PathGradient
-from unrender.estimators.stock import StockGradient
+from unrender.estimators.path import PathGradient, StockGradient
 from unrender.images.base import ImageEstimator
 from unrender.images.denoising import Denoised
 from unrender.images.plain import Plain
@@ -20,8 +19,8 @@ from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.recipes import Adam
 from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
+from unrender.pixels.uniform import All
 
 
 class AdamOptions(Options):

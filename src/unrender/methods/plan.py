@@ -35,7 +35,7 @@ class Plan:
         optimizer: Optimizer.
         settings: {key: settings of a parameter whose own are None}.
         reasons: Choices and their reasons, one line each.
-        other_starts: Keys of unknowns of which other values are compared during a run whose picture differs, see `runs.other_start`.
+        other_starts: Keys of unknowns of which other values are compared during a run whose picture differs, see `runs.refinement`.
     """
 
     problem: Problem

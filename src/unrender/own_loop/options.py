@@ -15,9 +15,8 @@ from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
 from unrender.losses import L2
 from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
-from unrender.pixels.uniform import Uniform
+from unrender.pixels.uniform import All, Uniform
 from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Renderer as RendererPort
 from unrender.scene.parameter import Parameter

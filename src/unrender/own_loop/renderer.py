@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, frameworks
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
@@ -18,13 +18,12 @@ from unrender.core.trees import Tree, add, numpy
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses import Loss
-from unrender.own_loop import saved
+from unrender.own_loop import values
 from unrender.own_loop.options import Options, open_scene, problem_of
-from unrender.own_loop.saved import RendererState
-from unrender.own_loop.stream import Batch, Rendered, Stream
+from unrender.own_loop.stream import Batch, Rendered, RendererState, Stream, read_state, write_state
 from unrender.own_loop.values import Exchange, LoopParameters, with_drjit, with_torch
-from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
+from unrender.pixels.uniform import All
 from unrender.scene.bounds import off_ends
 from unrender.scene.render import render as render_view
 from unrender.scene.validation import longest_path
@@ -203,11 +202,11 @@ class Renderer:
             return on_host
         import torch  # pyright: ignore[reportMissingImports]
 
-        like = next(value for value in inputs.values.values() if frameworks.is_torch(value))
+        like = next(value for value in inputs.values.values() if values.is_torch(value))
         indices = [
             torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (on_host.sensors, on_host.pixels)
         ]
-        return Batch(indices[0], indices[1], frameworks.to_torch(on_host.weights, like))
+        return Batch(indices[0], indices[1], values.to_torch(on_host.weights, like))
 
     def gather(self, images: Any) -> Any:
         """Return the pixels of the last render, (N, C), from an image (H, W, C), or from a list of images with several sensors.
@@ -229,12 +228,12 @@ class Renderer:
             )
         sizes = [self._port.resolutions()[sensor] for sensor in self._options.sensors]
         for image, size in zip(several, sizes, strict=True):
-            if frameworks.shape(image)[:2] != size or len(frameworks.shape(image)) != 3:
-                raise InputError(f"Renderer: expected an image {(*size, 3)}, got {frameworks.shape(image)}")
-        if frameworks.is_torch(batch.weights) or not arrays.is_drjit(batch.weights):
-            flat = [image.reshape(-1, frameworks.shape(image)[2]) for image in several]
+            if values.shape_of(image)[:2] != size or len(values.shape_of(image)) != 3:
+                raise InputError(f"Renderer: expected an image {(*size, 3)}, got {values.shape_of(image)}")
+        if values.is_torch(batch.weights) or not arrays.is_drjit(batch.weights):
+            flat = [image.reshape(-1, values.shape_of(image)[2]) for image in several]
             starts = np.cumsum([0, *(len(rows) for rows in flat)])[:-1]
-            if frameworks.is_torch(batch.weights):
+            if values.is_torch(batch.weights):
                 import torch  # pyright: ignore[reportMissingImports]
 
                 rows = torch.cat([torch.as_tensor(rows).to(batch.weights) for rows in flat])
@@ -268,14 +267,14 @@ class Renderer:
         A renderer with the same options that loads it continues as this one would, bit for bit where sums have a fixed order (see
         `optimize`).
         """
-        return saved.write(Path(path), self.state, self._options.describe())
+        return write_state(Path(path), self.state, self._options.describe())
 
     def load(self, path: str | Path) -> None:
         """Continue from a state that `save` wrote, with its step and seed.
 
         Raises `InputError` for a damaged file, or one with other options.
         """
-        loaded = saved.read(Path(path), self._options.describe(), self.state)
+        loaded = read_state(Path(path), self._options.describe(), self.state)
         streams = {name: self._stream(name) for name in loaded.streams}
         for name, stream in streams.items():
             stream.state = loaded.streams[name]
@@ -328,7 +327,7 @@ class Renderer:
     def _with_torch(
         self, inputs: LoopParameters, images: tuple[Any, ...], backward: Callable[..., Tree]
     ) -> tuple[Any, ...]:
-        tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
+        tensors = {key: value for key, value in inputs.values.items() if values.is_torch(value)}
         detached = LoopParameters("torch", {key: value.detach() for key, value in tensors.items()})
         device = images[0].device
 

@@ -1,20 +1,23 @@
-"""Conversion of parameters, images and gradients between a loop's framework and the renderer's arrays."""
+"""Conversion of parameters, images and gradients between a loop's framework (NumPy, Dr.Jit or PyTorch) and the renderer's arrays.
+
+PyTorch is never imported here first: an array of it can only come from a program that has imported it.
+"""
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import numpy as np
 
-from unrender.core import arrays, checks, frameworks
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
-from unrender.core.frameworks import Framework
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Renderer
@@ -122,7 +125,7 @@ class LoopParameters:
         """Return the same values, detached from the loop's graph."""
 
         def detach(x: Any) -> Any:
-            return x.detach() if frameworks.is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
+            return x.detach() if is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
 
         return LoopParameters(self.framework, {key: detach(value) for key, value in self.values.items()})
 
@@ -169,7 +172,7 @@ class Exchange:
                 raise InputError(f"Renderer: no value for parameter {key}{did_you_mean(key, others)}")
         self._refuse_unused(values, others)
         parameters = {key: values[key] for key in self._keys}
-        return LoopParameters(frameworks.framework(parameters.values(), "Renderer"), parameters)
+        return LoopParameters(framework(parameters.values(), "Renderer"), parameters)
 
     def _refuse_unused(self, values: Any, others: list[Any]) -> None:
         """Raise `InputError` for values that would be ignored.
@@ -237,15 +240,15 @@ class Exchange:
                     raise InputError(f"Renderer: this renderer computes in NumPy; {expected}")
                 return image
             case "torch":
-                like = next(x for x in inputs.values.values() if frameworks.is_torch(x))
-                return frameworks.to_torch(arrays.numpy(image), like)
+                like = next(x for x in inputs.values.values() if is_torch(x))
+                return to_torch(arrays.numpy(image), like)
 
     def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
         """Return the derivative of the loop's loss with respect to an image of this shape as the renderer's array.
 
         Raises `InputError` for another shape, or values that are not finite.
         """
-        got = frameworks.shape(derivative)
+        got = shape_of(derivative)
         if got != shape:
             raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {got}")
         if self._on_device and arrays.is_drjit(derivative):
@@ -253,7 +256,7 @@ class Exchange:
             if not arrays.all_finite(detached):
                 _refuse_derivative(arrays.numpy(detached))
             return detached
-        values = frameworks.host(derivative, "Renderer: the derivative of the loss")
+        values = host(derivative, "Renderer: the derivative of the loss")
         if not np.isfinite(values).all():
             _refuse_derivative(values)
         return self._renderer.array(values)
@@ -267,10 +270,8 @@ class Exchange:
             case "numpy":
                 return arrays.numpy(gradient).reshape(np.shape(value))
             case "torch":
-                like = (
-                    value if frameworks.is_torch(value) else next(filter(frameworks.is_torch, inputs.values.values()))
-                )
-                return frameworks.to_torch(arrays.numpy(gradient).reshape(frameworks.shape(value)), like)
+                like = value if is_torch(value) else next(filter(is_torch, inputs.values.values()))
+                return to_torch(arrays.numpy(gradient).reshape(shape_of(value)), like)
             case "drjit":
                 if not arrays.is_drjit(value):
                     return gradient
@@ -287,7 +288,7 @@ class Exchange:
             raise InputError(f"parameter {key}: expected shape {self.known[key].shape}, got {_kind(value)}") from error
 
     def _host(self, key: str, value: Any) -> np.ndarray:
-        array = frameworks.host(value, f"parameter {key}")
+        array = host(value, f"parameter {key}")
         if not np.isfinite(array).all():
             _refuse_values(key, array)
         return self._fit(key, array)
@@ -324,3 +325,60 @@ def _first_of(values: np.ndarray) -> str:
     wrong = np.argwhere(~np.isfinite(values))
     place = tuple(int(n) for n in wrong[0])
     return f"{values[place]} at {place}, one of {len(wrong)} of {values.size} values"
+
+
+Framework = Literal["numpy", "drjit", "torch"]
+
+
+def is_torch(x: Any) -> bool:
+    """Return whether `x` is a PyTorch tensor."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(x, torch.Tensor)
+
+
+def framework(values: Iterable[Any], owner: str) -> Framework:
+    """Return the framework of some arrays: "numpy" if none is of Dr.Jit or PyTorch.
+
+    Numbers, lists and NumPy arrays may be mixed with arrays of one other framework.
+
+    Raises `InputError` that names `owner` if arrays of Dr.Jit and PyTorch are mixed.
+    """
+    kinds: set[Framework] = set()
+    for value in values:
+        if is_torch(value):
+            kinds.add("torch")
+        elif arrays.is_drjit(value):
+            kinds.add("drjit")
+    if len(kinds) > 1:
+        raise InputError(f"{owner}: arrays of Dr.Jit and of PyTorch are mixed; use one framework for all")
+    return kinds.pop() if kinds else "numpy"
+
+
+def host(x: Any, owner: str) -> np.ndarray:
+    """Convert an array of any framework, or nested lists, to NumPy. Waits for the device.
+
+    A NumPy array of float64 is returned itself. Other types than float64 become float32.
+    Raises `InputError` that names `owner` if the values are not integers or real numbers.
+    """
+    if is_torch(x):
+        x = x.detach().cpu().numpy()
+    elif arrays.is_drjit(x):
+        x = x.numpy()
+    try:
+        values = np.asarray(x)
+    except ValueError as error:  # ragged lists
+        raise InputError(f"{owner}: expected an array of numbers, got {type(x).__name__}: {error}") from error
+    if values.dtype.kind not in "fiu":
+        raise InputError(f"{owner}: expected an array of numbers, got {type(x).__name__} of {values.dtype}")
+    return values if values.dtype == np.float64 else values.astype(np.float32)
+
+
+def to_torch(values: np.ndarray, like: Any) -> Any:
+    """Return `values` as a PyTorch tensor with the type and device of the tensor `like`. The tensor owns its memory."""
+    torch = sys.modules["torch"]
+    return torch.from_numpy(np.array(values)).to(like)
+
+
+def shape_of(x: Array) -> tuple[int, ...]:
+    """Return the shape of an array of any framework as a tuple of integers."""
+    return tuple(int(n) for n in np.shape(x)) if not hasattr(x, "shape") else tuple(int(n) for n in x.shape)

@@ -2,7 +2,6 @@
 
 from unrender.pixels.adaptive import Adaptive, LossProportional
 from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.all import All
-from unrender.pixels.uniform import Uniform, Views
+from unrender.pixels.uniform import All, Uniform, Views
 
 __all__ = ["Adaptive", "AdaptiveCounts", "All", "LossProportional", "Uniform", "Views"]

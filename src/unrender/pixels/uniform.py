@@ -1,4 +1,4 @@
-"""Mini-batches in which all pixels, or all views, are equally likely."""
+"""All pixels of all views, and mini-batches in which all pixels, or all views, are equally likely."""
 
 from __future__ import annotations
 
@@ -99,3 +99,26 @@ def _all_pixels(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> Mi
     views = arrays.like_integers(np.repeat(chosen, sizes), like)
     pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)
     return MiniBatch(PixelSample(views, pixels, like))
+
+
+@dataclass(frozen=True)
+class AllState(Unchanged):
+    """Empty state."""
+
+
+@register
+@dataclass(frozen=True)
+class All(PixelSampler):
+    """All pixels of all views at every step."""
+
+    def init(self, problem: Problem, parameters: Tree) -> AllState:
+        del problem, parameters
+        return AllState()
+
+    def draw(self, problem: Problem, parameters: Tree, state: AllState, key: Key) -> tuple[MiniBatch, AllState]:
+        del problem, parameters, key
+        return MiniBatch(None), state
+
+    def redraw(self, problem: Problem, state: AllState, key: Key) -> MiniBatch:
+        del problem, state, key
+        return MiniBatch(None)

@@ -12,9 +12,8 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import listed
-from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
-from unrender.runs.numbers import MOST_ELEMENTS
+from unrender.runs.numbers import MOST_ELEMENTS, TOO_SHORT
 from unrender.runs.result import Result
 from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
 from unrender.scene.bounds import project

@@ -27,8 +27,6 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
-TOO_SHORT = "the run is too short for this test; use more steps or seconds, or fewer pixels"
-"""Reason of a test that takes more than its share of the run's time."""
 _LATE, _UNRESOLVED = "the run is too short for this test", "whose share in the pictures is not resolved"
 """Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
 

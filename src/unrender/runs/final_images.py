@@ -22,7 +22,6 @@ from unrender.runs.determination import (
     untested_factor,
     with_lost,
 )
-from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.final_checks import (
     beyond_priors,
     differs_still,
@@ -35,6 +34,7 @@ from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
+from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
 from unrender.runs.verification import Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER

@@ -23,8 +23,7 @@ from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
-from unrender.runs.numbers import Differences, Numbers
-from unrender.runs.numbers_check import NumbersCheck
+from unrender.runs.numbers import Differences, Numbers, NumbersCheck
 from unrender.runs.verification import compares
 from unrender.scene.problem import Problem
 from unrender.statistics import scores

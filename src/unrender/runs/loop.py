@@ -21,9 +21,8 @@ from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Measuring
 from unrender.runs.callbacks import COMPILING
-from unrender.runs.noise import GradientNoise
 from unrender.runs.result import Result
-from unrender.runs.run import Run, RunState, interruptible
+from unrender.runs.run import GradientNoise, Run, RunState, interruptible
 from unrender.runs.watches import remarks
 from unrender.scene.surfaces import guarded
 

@@ -12,7 +12,6 @@ import numpy as np
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
-from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import (
     COUNTED,
     FEWEST_PROBES,
@@ -26,6 +25,7 @@ from unrender.runs.image_sensitivity import (
     transposed,
 )
 from unrender.runs.least_squares import check_numbers, checked_keys
+from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
 from unrender.runs.verification import OF_FUNCTION, compares, misfit_of_views
 from unrender.scene.problem import Problem

@@ -29,8 +29,7 @@ from unrender.runs.loop import descend, prepare
 from unrender.runs.metadata import RunAnnotations, describe, describe_run, fingerprint_of, first_values
 from unrender.runs.notebook import NotebookProgress
 from unrender.runs.number_means import NumberMeans
-from unrender.runs.other_start import OtherStart
-from unrender.runs.refinement import MeshRefinement, Refinement
+from unrender.runs.refinement import MeshRefinement, OtherStart, Refinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, raise_termination, to_numpy
 from unrender.runs.verify import Verify

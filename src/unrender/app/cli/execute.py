@@ -22,8 +22,8 @@ from unrender.runs.final_checks import image_name
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
-from unrender.runs.other_start import BEGUN_AGAIN
 from unrender.runs.progress import Progress
+from unrender.runs.refinement import BEGUN_AGAIN
 from unrender.runs.result import Result
 from unrender.runs.resume import StoredRun, resume_run
 from unrender.scene.notebook import describe_views

@@ -23,15 +23,17 @@ from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorke
 from unrender.app.sweeps.record import (
     RUN_FOLDERS,
     SWEEP,
+    Started,
     SweepPlan,
     SweepRecord,
     TrialRecord,
+    Trials,
     best_folders,
     run_name,
+    trial_record,
     write_sweep,
 )
 from unrender.app.sweeps.search import Search
-from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.backend.variant import check_threads
 from unrender.core.text import visible
 from unrender.display import formatting

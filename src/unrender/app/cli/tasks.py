@@ -20,8 +20,7 @@ from rich.text import Text
 from unrender.app.cli import arguments
 from unrender.app.cli.execute import RunOrder, execution, resumed
 from unrender.app.distributed.cluster import prepare_worker
-from unrender.app.sweeps.record import RunOutcome
-from unrender.app.sweeps.trials import initial_errors, stated_error
+from unrender.app.sweeps.record import RunOutcome, initial_errors, stated_error
 from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting

@@ -25,8 +25,8 @@ from unrender.images.denoising import Denoised
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.all import All
 from unrender.pixels.pixel_statistics import PilotRequest
+from unrender.pixels.uniform import All
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.problem import Problem
 

@@ -54,7 +54,7 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
     """Return the plan with the best start among places of some unknowns, if its picture is much better.
 
     Gauss-Newton steps end in the nearest minimum. Poses of shapes are compared on a plateau alone. Beside unknown colours no places are
-    compared, because those of the best picture make up for wrong colours; see `runs.other_start`.
+    compared, because those of the best picture make up for wrong colours; see `runs.refinement`.
 
     Args:
         traits: Traits of the problem.

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unrender.backend.access import can_change, can_read
+from unrender.backend.cache import can_change, can_read
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, reason_of
 
