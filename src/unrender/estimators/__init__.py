@@ -21,7 +21,7 @@ __getattr__, _ = lazy.attach(
         "MetaEstimator": "meta",
         "PathGradient": "path",
         "SmoothedDerivatives": "smoothed",
-        "StockGradient": "stock",
+        "StockGradient": "path",
     },
 )
 __all__ = [
