@@ -14,7 +14,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import Lenses, Relief, dr, mi, parts, textures
+from benchmarks.internals import Lenses, Relief, dr, mi, parts
 from benchmarks.races import TUNING_SEED, relative_error, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
@@ -31,14 +31,14 @@ _PTRACER = {"type": "ptracer", "hide_emitters": False}
 
 def picture() -> np.ndarray:
     """The true texture of both panels."""
-    return textures.photograph("coffee", _TEXELS)
+    return parts.photograph("coffee", _TEXELS)
 
 
 def _scene() -> dict[str, Any]:
     """Two textured panels on a floor under two lamps."""
 
     def panel(x: float) -> dict[str, Any]:
-        paint = {"type": "diffuse", "reflectance": textures.bitmap(picture())}
+        paint = {"type": "diffuse", "reflectance": parts.bitmap(picture())}
         return parts.rectangle((x, 0, -0.3), (0.7, 0, 0.3 * np.sign(x)), (0, 0.8, 0), paint)
 
     def lamp(z: float) -> dict[str, Any]:
