@@ -1,6 +1,6 @@
 """Exports read by other libraries than those that wrote them, as a scene of Mitsuba's plugins.
 
-A .glb file is read by trimesh, an OBJ file's mesh by Mitsuba and its materials here, from the text; a .usdz file by USD's own library. What
+A .glb file is read by trimesh, an OBJ file's mesh by Mitsuba and its materials here, from the text. What
 they say is taken by their formats' own rules: base colours are sRGB, other maps linear; texture coordinates grow downwards in glTF and
 upwards in the others; of a normal map, green goes up the picture.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import io
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-__all__ = ["READERS", "Look", "described", "read_glb", "read_obj", "read_usd"]
+__all__ = ["READERS", "Look", "described", "read_glb", "read_obj"]
 
 _DEFAULT_IOR = 1.5
 
@@ -135,59 +134,7 @@ def read_obj(folder: Path) -> list[Look]:
     ]
 
 
-def read_usd(folder: Path) -> list[Look]:
-    """asset.usdz."""
-    Usd, UsdShade = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdShade"))
-    path = folder / "asset.usdz"
-    stage = Usd.Stage.Open(str(path))
-    pack = zipfile.ZipFile(path)
-    found = []
-    for prim in stage.Traverse():
-        if prim.GetTypeName() != "Mesh":
-            continue
-        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-        surface = material.ComputeSurfaceSource("")[0]
-
-        def value(name: str, surface: Any = surface) -> np.ndarray:
-            source = surface.GetInput(name)
-            if not source:
-                return np.array(np.nan)
-            if not source.HasConnectedSource():
-                return np.array(source.Get(), float)
-            texture = UsdShade.Shader(source.GetConnectedSources()[0][0].source)
-            file = str(texture.GetInput("file").Get().path).removeprefix("./")
-            name = next(each for each in pack.namelist() if each.endswith(file))
-            pixels = _unit(Image.open(io.BytesIO(pack.read(name))))
-            return linear(pixels) if texture.GetInput("sourceColorSpace").Get() == "sRGB" else pixels
-
-        def attribute(name: str, prim: Any = prim) -> np.ndarray | None:
-            given = prim.GetAttribute(name).Get()
-            return None if given is None else np.array(given, float)
-
-        points, uv = attribute("points"), attribute("primvars:st")
-        assert points is not None
-        normal = value("normal")
-        found.append(
-            Look(
-                points,
-                np.array(prim.GetAttribute("faceVertexIndices").Get()).reshape(-1, 3),
-                attribute("normals"),
-                None if uv is None else uv * [1, -1] + [0, 1],
-                value("diffuseColor"),
-                value("roughness"),
-                value("metallic"),
-                normal if normal.ndim else None,
-                float(value("ior")),
-                bool(prim.GetAttribute("doubleSided").Get()),
-            )
-        )
-    return found
-
-
 READERS: dict[str, Callable[[Path], list[Look]]] = {"glb": read_glb, "obj": read_obj}
-"""Of those that are installed."""
-if importlib.util.find_spec("pxr") is not None:
-    READERS["usd"] = read_usd
 
 
 def described(looks: list[Look], environment: Path, to_world: np.ndarray) -> dict[str, Any]:

@@ -83,18 +83,6 @@ def test_obj_and_ply_as_mitsuba_reads_them(tmp_path: Path) -> None:
     )
 
 
-def test_usd_as_its_own_library_reads_it(tmp_path: Path) -> None:
-    kit: Any = pytest.importorskip("pxr.Usd")
-    formats.write_usd(asset(quad()), tmp_path)
-    stage = kit.Stage.Open(str(tmp_path / formats.USD_FILE))
-    mesh = next(prim for prim in stage.Traverse() if prim.GetTypeName() == "Mesh")
-    np.testing.assert_allclose(mesh.GetAttribute("primvars:st").Get()[3], [0, 1])
-    np.testing.assert_array_equal(mesh.GetAttribute("faceVertexIndices").Get(), [0, 1, 2, 0, 2, 3])
-    files = [prim.GetAttribute("inputs:file").Get() for prim in stage.Traverse() if prim.HasAttribute("inputs:file")]
-    assert len(files) == 3
-    assert all(file.resolvedPath for file in files)
-
-
 @pytest.mark.parametrize(("mirrored", "green"), [(False, 0.7), (True, 0.3)])
 def test_green_of_normals_goes_up_the_picture(mirrored: bool, green: float) -> None:
     """Mitsuba's second tangent is n × ∂p/∂u. A picture that is seen from behind has that one down."""

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich import console
-from rich.console import Group
-from rich.console import RenderableType as Renderable
 from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
@@ -18,7 +16,7 @@ from unrender.core.text import visible
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["Console", "Group", "Renderable", "columns", "echo", "plain"]
+__all__ = ["Console", "columns", "echo", "plain"]
 
 _UNESCAPED = "\n\t"
 

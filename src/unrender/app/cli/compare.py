@@ -266,15 +266,15 @@ def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cl
             (outcome,), written = ended.value
             tasks.receive(folder, written)
         outcomes.append(outcome)
-        display.end(name, f"{name}: {outcome.message or f'{outcome.status}, {outcome.steps} steps'}")
+        display.end(f"{name}: {outcome.message or f'{outcome.status}, {outcome.steps} steps'}")
 
     console.print(f"{len(waiting)} runs on {executor.slots} workers, {job.threads} threads each")
-    with tasks.open_job(job), TaskDisplay(console, len(waiting), "runs") as display:
+    display = TaskDisplay(console, len(waiting))
+    with tasks.open_job(job):
         try:
             while waiting or executor.pending:
                 while waiting and executor.pending < executor.slots:
                     run = waiting.pop(0)
-                    display.begin(run.name, run.method, (folder / run.name,))
                     executor.start((run.name, run.seed), job, [run])
                 for ended in executor.wait(_POLL_SECONDS):
                     take(ended)

@@ -19,7 +19,6 @@ TOLERANCE = 1e-3
 
 _FEATURES = {
     "capture": "photographs, glTF, .mp4",
-    "usd": "USD",
     "remesh": "remeshing",
     "ray": "workers",
     "sweep": "sweeps by tpe",

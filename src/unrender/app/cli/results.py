@@ -151,7 +151,7 @@ def export(
         typer.Option(
             "--format",
             metavar="NAME,NAME",
-            help="mitsuba, glb, obj, ply, usd, environment (.exr, .hdr), blender (.glb, light, cameras and a script).",
+            help="mitsuba, glb, obj, ply, environment (.exr, .hdr), blender (.glb, light, cameras and a script).",
         ),
     ] = "mitsuba",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,

@@ -45,7 +45,7 @@ from unrender.runs.folder.schema import DOUBTFUL, ENDED
 from unrender.runs.result import TERMINATED as BY_SIGTERM
 from unrender.scene.problem import Problem
 
-_SHOWN, _SHOWN_LIVE = 10, 5
+_SHOWN = 10
 _MANY = 1e9
 """Degrees of freedom of a standard error that is known."""
 
@@ -62,7 +62,7 @@ def line(trial: TrialRecord) -> str:
 def show(console: Console, record: SweepRecord) -> None:
     """Print the outcome: the best trials, the number of trials, and the command for the best one."""
     if record.trials:
-        console.print(_table(record.trials, _SHOWN))
+        console.print(_table(record.trials))
     counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "failed")}
     outcome = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     console.say(f"{outcome or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all")
@@ -115,12 +115,12 @@ def run_command(record: SweepRecord) -> str:
     return f"{shlex.join(words)} {record.best_line}"
 
 
-def _table(trials: list[TrialRecord], most: int) -> Table:
+def _table(trials: list[TrialRecord]) -> Table:
     known = [(t.error, t.number, t) for t in trials if t.error is not None and t.status == "finished"]
     ordered = [t for _, _, t in sorted(known, key=lambda entry: entry[:2])]
     names = list(ordered[0].settings) if ordered else []
     table = columns("trial", *names, "error", "steps", "seconds", "")
-    for trial in ordered[:most]:
+    for trial in ordered[:_SHOWN]:
         steps = "+".join(str(run.steps) for run in trial.runs)
         seconds = f"{sum(run.seconds for run in trial.runs):.1f}"
         values = [Text(visible(trial.settings.get(name, ""))) for name in names]
@@ -277,31 +277,24 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
     left = state.trials.search.trials - len(state.trials.ended)
     had = f", {len(state.trials.ended)} done before" if state.trials.ended else ""
     console.say(f"{plan.method}, {plan.search}: {left} trials{seeds} {where}{had}")
+    console.say(f"to watch them: unrender watch {shlex.quote(str(session.folder))}")
 
 
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
     plan, trials = state.record.plan, state.trials
-    display = TaskDisplay(
-        console, trials.search.trials, "trials", lambda: _table(list(trials.ended.values()), _SHOWN_LIVE)
-    )
-    display.skip(len(trials.ended))
-    with display:
-        while not trials.done and not state.stopped:
-            while executor.pending < executor.slots and (started := trials.next()) is not None:
-                run_tasks = _tasks(plan, started)
-                display.begin(
-                    started.number, _settings(started.settings), tuple(session.folder / task.name for task in run_tasks)
-                )
-                state.running[started.number] = started
-                executor.start(started.number, job, run_tasks)
-            for ended in executor.wait(_POLL_SECONDS):
-                record = _ended(session, state, ended)
-                if record is None:
-                    break
-                trials.end(record)
-                display.end(record.number, line(record))
-                _advise_on_few_steps(state, record, display)
-                state.save(session.folder)
+    display = TaskDisplay(console, trials.search.trials, len(trials.ended))
+    while not trials.done and not state.stopped:
+        while executor.pending < executor.slots and (started := trials.next()) is not None:
+            state.running[started.number] = started
+            executor.start(started.number, job, _tasks(plan, started))
+        for ended in executor.wait(_POLL_SECONDS):
+            record = _ended(session, state, ended)
+            if record is None:
+                break
+            trials.end(record)
+            display.end(line(record))
+            _advise_on_few_steps(state, record, display)
+            state.save(session.folder)
 
 
 def _advise_on_few_steps(state: _State, record: TrialRecord, display: TaskDisplay) -> None:

@@ -7,8 +7,8 @@ Files for other programs:
 
 | item | in Mitsuba | in the files |
 |---|---|---|
-| axes | the world of the scene, right-handed | unchanged: glTF and USD call y up; Blender's importer turns it to z |
-| texture coordinates | v downwards | downwards in glTF; upwards in OBJ, PLY and USD |
+| axes | the world of the scene, right-handed | unchanged: glTF calls y up; Blender's importer turns it to z |
+| texture coordinates | v downwards | downwards in glTF; upwards in OBJ and PLY |
 | roughness | perceptual, α = roughness² | the same in all |
 | normal map | second tangent n × ∂p/∂u | green points up; flipped where the texture lies mirrored on the mesh |
 | base colour | linear, every bit | 8 bits, sRGB; values outside [0, 1] are clipped |

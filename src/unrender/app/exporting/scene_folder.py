@@ -100,7 +100,7 @@ def export(
         out: the new folder.
         overwrite: whether an earlier export may be replaced.
         spp: samples per pixel in scene.xml.
-        formats: "mitsuba", "glb", "obj", "ply", "environment", "blender", "usd".
+        formats: "mitsuba", "glb", "obj", "ply", "environment", "blender".
 
     Raises:
         InputError: the run folder or the problem cannot be read, `out` cannot be written, a description cannot hold a parameter, the
