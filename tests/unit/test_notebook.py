@@ -106,23 +106,6 @@ def test_a_result_without_a_step_or_a_truth_is_shown() -> None:
     empty = Result(values, values, [], 0.0, 0.0, "interrupted")
     assert "0 steps" in repr(empty)
     assert Outline(empty._repr_html_()).open == []
-    assert empty.plot()._repr_png_().startswith(b"\x89PNG")
-
-
-def test_the_figure_has_the_maps_and_two_curves_and_leaves_pyplot_alone(result: Result) -> None:
-    pyplot = sys.modules.get("matplotlib.pyplot")
-    figure = result.plot()
-    assert sys.modules.get("matplotlib.pyplot") is pyplot
-    titles = [axes.get_title() or axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == [
-        "truth: map",
-        "start: map",
-        "recovered: map",
-        "parameter error (RMSE)",
-        "loss, of the steps' samples",
-    ]
-    assert [len(axes.get_lines()) for axes in figure.axes[3:]] == [2, 1]
-    assert figure._repr_png_().startswith(b"\x89PNG")
 
 
 class Shell:

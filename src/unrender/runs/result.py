@@ -13,7 +13,6 @@ from unrender.runs.folder.contents import write_result
 from unrender.runs.folder.history import steps_in
 
 if TYPE_CHECKING:
-    from unrender.runs.figure import ResultFigure
     from unrender.runs.verification import Misfit
 
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
@@ -126,16 +125,6 @@ class Result:
         from unrender.runs import notebook
 
         return notebook.html(self)
-
-    def plot(self) -> ResultFigure:
-        """Return a matplotlib figure with images of the views if there are any (`pictures`), recovered textures with truth and start, and
-        curves.
-
-        It belongs to no pyplot session: `result.plot().savefig("result.png")`.
-        """
-        from unrender.runs.figure import plot
-
-        return plot(self)
 
     @property
     def steps(self) -> int:
