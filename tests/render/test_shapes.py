@@ -302,3 +302,18 @@ def test_a_mesh_that_touches_or_crosses_another_shape_is_told_once() -> None:
     stands = {"thing": meshes.triangles("thing", diamond, np.array(around), {"type": "diffuse"})}
     assert lines(-0.3, **stands) == []  # one point of it rests on the floor
     assert not [line for line in MitsubaRenderer(scene(), 2, ["thing.translation"]).notices if "touches" in line]
+
+
+def test_a_mesh_that_views_show_in_mirrors_or_through_smooth_glass_is_told() -> None:
+    def lines(bsdf: dict[str, Any], place: Any) -> list[str]:
+        pane = {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+        return [line for line in MitsubaRenderer(scene(pane=pane), 6, [KEY]).notices if "mirrors" in line]
+
+    before = mi.ScalarTransform4f().translate([0, 0.2, 1])
+    below = mi.ScalarTransform4f().translate([0, -0.5, 0]).rotate([1, 0, 0], -90)
+    assert lines({"type": "dielectric"}, before)[0].startswith(
+        "views show 100% of thing in mirrors or through smooth glass, where"
+    )
+    assert len(lines({"type": "conductor"}, below)) == 1
+    assert lines({"type": "roughconductor"}, below) == lines({"type": "diffuse"}, below) == []
+    assert lines({"type": "conductor"}, below.translate([9, 0, 0])) == []  # out of sight

@@ -14,10 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender.core.text import listed
 from unrender.rendering.mitsuba import gpu, mesh_layout
 from unrender.rendering.mitsuba.integrators.base import registry_id
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph, has_instances, scene_of
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, scene_of
 
 
 @dataclass(frozen=True)
@@ -153,44 +152,6 @@ def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     return MeshEdges(ends[first], thirds, faces_at != 2, (torn | flat) & (faces_at > 1))
 
 
-_NEAR = 1e-3
-"""Distance from another shape that counts as contact, relative to the diagonal of the mesh's bounding box."""
-
-
-def contact_notices(scene: Any, keys: Iterable[str]) -> list[str]:
-    """Return a notice about each mesh with unknown vertices that touches or crosses other shapes, as loaded.
-
-    The middle of an edge touches a shape on a normal of the edge's faces. Ends of edges do not count: they may meet a shape at one point.
-
-    Args:
-        scene: `mi.Scene` without instances.
-        keys: the unknown parameters.
-    """
-    unknown, lines = {key for key in keys if key.endswith(f".{mesh_layout.POSITIONS}")}, []
-    for mesh in [shape for shape in scene.shapes() if f"{shape.id()}.{mesh_layout.POSITIONS}" in unknown]:
-        rest = [shape for shape in scene.shapes() if shape is not mesh]
-        edges = edges_of(mesh, None)
-        if not rest or not len(edges.ends) or has_instances(scene):
-            continue
-        points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
-        start, along = points[edges.ends[:, 0]], points[edges.ends[:, 1]] - points[edges.ends[:, 0]]
-        near = _NEAR * np.linalg.norm(np.ptp(points, axis=0))
-        normals = [near * _unit(np.cross(along, points[third] - start)) for third in edges.thirds.T]
-        rays = [(start + 0.05 * along, 0.9 * along), *((start + 0.5 * along + n, -2.0 * n) for n in normals)]
-        origin, way = (np.concatenate(of) for of in zip(*rays, strict=True))
-        ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(way.T))
-        ray.maxt = 1.0  # pyright: ignore[reportAttributeAccessIssue]
-        hits: Any = scene_of(rest).ray_intersect_preliminary(ray, coherent=False)
-        numbers = set(np.unique(np.array(registry_id(hits.shape))[np.array(hits.is_valid())]).tolist())
-        met = [shape.id() for shape in rest if int(registry_id(mi.ShapePtr(shape))[0]) in numbers]
-        if met:
-            lines.append(
-                f"{mesh.id()} touches or crosses {listed(met)}, where path gradients of its vertices are noisy and may be biased: leave "
-                "a gap between them"
-            )
-    return lines
-
-
 _ROWS, _COLUMNS = 64, 128
 """Rows and columns of the mesh. Its silhouette deviates from the sphere's by less than 1/1700 of the radius."""
 _PARTS = ("translation", "rotation", "scale", mesh_layout.POSITIONS)
@@ -260,10 +221,11 @@ def _mesh(sphere: Any) -> Any:
     outwards = np.array(sample.p).reshape(-1) - matrix[:3, 3]
     if outwards @ np.array(sample.n).reshape(-1) < 0:  # `flip_normals`
         normals, faces = -normals, faces[:, ::-1]
-    mesh = mesh_layout.build(sphere.id(), points, faces, _unit(normals), np.stack([u, v], -1), sphere.bsdf())
+    mesh = mesh_layout.build(sphere.id(), points, faces, unit(normals), np.stack([u, v], -1), sphere.bsdf())
     mesh.set_id(sphere.id())
     return mesh
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (N, 3) of length 1."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -16,8 +16,9 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, poses
-from unrender.rendering.mitsuba.edges import contact_notices, moving_targets
+from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.film_response import is_spectral
+from unrender.rendering.mitsuba.geometry_notices import contact_notices, specular_notices
 from unrender.rendering.mitsuba.geometry_terms import (
     lens_parameters,
     moved_sensor,
@@ -93,6 +94,7 @@ class MitsubaRenderer:
             *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
             *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
             *contact_notices(self.pair.current, keys),
+            *specular_notices(self.pair.current, keys),
             *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         self._formats = formats(self.pair.current.sensors())

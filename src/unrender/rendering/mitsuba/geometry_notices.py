@@ -1,0 +1,105 @@
+"""Notices about moving meshes whose path gradients omit something, from the scene as loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core.text import listed
+from unrender.rendering.mitsuba import mesh_layout
+from unrender.rendering.mitsuba.edges import edges_of, unit
+from unrender.rendering.mitsuba.integrators.base import registry_id
+from unrender.rendering.mitsuba.parameters import is_mirror_or_glass
+from unrender.rendering.mitsuba.scene_graph import has_instances, scene_of
+
+_NEAR = 1e-3
+"""Distance from another shape that counts as contact, relative to the diagonal of the mesh's bounding box."""
+
+
+def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
+    """Return a notice about each mesh with unknown vertices that touches or crosses other shapes, as loaded.
+
+    The middle of an edge touches a shape on a normal of the edge's faces. Ends of edges do not count: they may meet a shape at one point.
+
+    Args:
+        scene: `mi.Scene` without instances.
+        keys: the unknown parameters.
+    """
+    lines = []
+    for mesh in _unknown_meshes(scene, keys):
+        rest = [shape for shape in scene.shapes() if shape is not mesh]
+        edges = edges_of(mesh, None)
+        if not rest or not len(edges.ends) or has_instances(scene):
+            continue
+        points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
+        start, along = points[edges.ends[:, 0]], points[edges.ends[:, 1]] - points[edges.ends[:, 0]]
+        near = _NEAR * np.linalg.norm(np.ptp(points, axis=0))
+        normals = [near * unit(np.cross(along, points[third] - start)) for third in edges.thirds.T]
+        rays = [(start + 0.05 * along, 0.9 * along), *((start + 0.5 * along + n, -2.0 * n) for n in normals)]
+        origin, way = (np.concatenate(of) for of in zip(*rays, strict=True))
+        ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(way.T))
+        ray.maxt = 1.0  # pyright: ignore[reportAttributeAccessIssue]
+        hits: Any = scene_of(rest).ray_intersect_preliminary(ray, coherent=False)
+        numbers = set(np.unique(np.array(registry_id(hits.shape))[np.array(hits.is_valid())]).tolist())
+        met = [shape.id() for shape in rest if int(registry_id(mi.ShapePtr(shape))[0]) in numbers]
+        if met:
+            lines.append(
+                f"{mesh.id()} touches or crosses {listed(met)}, where path gradients of its vertices are noisy and may be biased: leave "
+                "a gap between them"
+            )
+    return lines
+
+
+_SIDE, _HITS, _SHARE = 64, 6, 0.05
+"""Rays along each side of a view, longest specular path in hits, and smallest share of a mesh's picture that is told."""
+
+
+def specular_notices(scene: Any, keys: Collection[str]) -> list[str]:
+    """Return a notice about each mesh with unknown vertices that views show in perfect mirrors or through smooth glass, as loaded.
+
+    Args:
+        scene: `mi.Scene`.
+        keys: the unknown parameters.
+    """
+    meshes = _unknown_meshes(scene, keys)
+    if not meshes or not any(is_mirror_or_glass(shape.bsdf()) for shape in scene.shapes()):
+        return []
+    counts = np.sum([_seen(sensor, scene, meshes) for sensor in scene.sensors()], axis=0)
+    shares = counts[:, 1] / np.maximum(counts.sum(axis=1), 1.0)
+    return [
+        f"views show {share:.0%} of {mesh.id()} in mirrors or through smooth glass, where path gradients omit its edges: its shape may end "
+        "wrong there; add views without them"
+        for mesh, share in zip(meshes, shares, strict=True)
+        if share >= _SHARE
+    ]
+
+
+def _seen(sensor: Any, scene: Any, meshes: list[Any]) -> np.ndarray:
+    """Return the number of rays of a sensor that hit each mesh directly, and after specular scattering, (M, 2)."""
+    sampler: Any = mi.load_dict({"type": "independent"})
+    sampler.seed(0, _SIDE**2)
+    number = dr.arange(mi.UInt32, _SIDE**2)
+    position = (mi.Point2f(number % _SIDE, number // _SIDE) + 0.5) / _SIDE
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    ray, active, counts = mi.Ray3f(ray), mi.Bool(True), np.zeros((len(meshes), 2))
+    for hit in range(_HITS):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        for index, mesh in enumerate(meshes):
+            on = active & (si.shape == mi.ShapePtr(mesh))
+            counts[index, min(hit, 1)] += np.count_nonzero(np.array(on))
+            active &= ~on
+        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+        active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        ray = mi.Ray3f(si.spawn_ray(si.to_world(bs.wo)))
+        dr.eval(ray, active)
+    return counts
+
+
+def _unknown_meshes(scene: Any, keys: Collection[str]) -> list[Any]:
+    """Return the meshes whose vertices are among these parameters."""
+    return [shape for shape in scene.shapes() if f"{shape.id()}.{mesh_layout.POSITIONS}" in keys]
