@@ -13,6 +13,7 @@ higher_order.table2, since the loop has no gradients of them.
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -238,6 +239,7 @@ def run(
         found["problems"][name] = entry
         print(f"{name}: speed {entry['speed']}", flush=True)
         del opened, error
+        gc.collect()  # the loop would trace the virtual calls of earlier scenes as well
         dr.sync_thread()
         yield found
 

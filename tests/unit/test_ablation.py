@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 
-from benchmarks.internals import CachingSession, prepare
+from benchmarks.internals import CachingSession, mi, prepare
+from benchmarks.stock_loop import StockViews
 from benchmarks.suite import ablation, run, scenes
 from tests.unit.test_auto import problem
 from unrender import InputError, gallery, losses, optimize, optimizers
 from unrender.images import Plain
+from unrender.rendering.mitsuba.frozen import _registered
 
 
 def test_each_part_is_left_out_alone() -> None:
@@ -63,3 +65,20 @@ def test_options_of_a_problem_of_the_gallery_reach_it(monkeypatch: pytest.Monkey
     """The film's resolution, too, which problems of others have by position."""
     monkeypatch.setattr(gallery, "problem", lambda name, **options: (name, options))
     assert scenes.problem("wall", None, 64, 64, 4096, resolution=512) == ("wall", {"resolution": 512})
+
+
+@pytest.mark.slow
+@pytest.mark.mitsuba
+def test_scenes_of_a_row_are_freed_before_the_next(mitsuba_variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    alive: list[int] = []
+
+    def loop(opened: Any, *arguments: Any) -> list[tuple[float, float]]:
+        alive.append(sum(1 for _ in _registered(mi.BSDFPtr)))
+        StockViews(opened)
+        return [(1.0, 0.5)]
+
+    monkeypatch.setattr(run, "loop", loop)
+    monkeypatch.setattr(run, "ours", lambda *arguments: (loop(arguments[0]), {"steps": 1, "compile_seconds": 0.0}))
+    sizes: dict[str, Any] = {"gallery_resolution": 8, "gallery_reference_spp": 1, "seeds": 1}
+    assert len(list(run.run(("poster",) * 2, retune=False, **sizes))) == 2
+    assert alive[0] == alive[2]
