@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from scripts.coverage.plugins import PLUGINS
 from spectral_scenes import COLOUR, DEPTH, KEYS, ROUGHNESS, SIZE, SPECTRUM, TEXTURE, scene, spectrum
 from statistical.zscores import agree
 from unrender.rendering.mitsuba import film_response, spectral_colours
@@ -67,13 +69,14 @@ def _camera(**changes: Any) -> dict[str, Any]:
         lambda: _camera(film={"pixel_format": "luminance"}),
         lambda: {"integrator": {"type": "path", "max_depth": DEPTH, "hide_emitters": True}},
         lambda: {"sky": {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), [1.5, 0.5, 0.1], np.float32))}},
+        lambda: {"sky": {"type": "sunsky", "sun_direction": [0.3, 0.8, 0.5]}},
         lambda: {"sky": {"type": "point", "position": [1, 1, 3], "intensity": spectrum(0.01, 0.05, 0.02)}},
         lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.3}}},
         lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "dielectric"}}},
         lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "plastic", "diffuse_reflectance": spectrum(0.1, 0.8)}}},
     ],
     ids=[
-        "thinlens", "orthographic", "gaussian", "mitchell", "luminance", "hidden", "envmap", "point", "gold", "glass",
+        "thinlens", "orthographic", "gaussian", "mitchell", "luminance", "hidden", "envmap", "sunsky", "point", "gold", "glass",
         "plastic",
     ],
 )  # fmt: skip
@@ -362,3 +365,42 @@ def test_the_scenes_of_another_variant_do_not_enter_kernels(renderer: MitsubaRen
     finally:
         ur.use(mitsuba_variant.replace("rgb", "spectral"))
     assert dr.isfinite(renderer.values([SPECTRUM])[SPECTRUM].array[0])
+
+
+def _refused(name: str, folder: Path) -> str:
+    """The line that refuses a plugin's scene, "" if it renders with finite pixels."""
+    description = PLUGINS[name].build(folder)
+    for part in description.values():
+        holder = part.get("bsdf", part) if isinstance(part, dict) else {}
+        for slot in ("reflectance", "base_color", "irradiance"):
+            if isinstance(found := holder.get(slot), dict) and found.get("raw"):
+                found["raw"] = False
+    try:
+        session = MitsubaRenderer(description, 3).prepare([], None, False)
+    except ur.InputError as error:
+        return str(error)
+    assert np.isfinite(np.array(session.image({}, SampleRequest(0, 4, 1)).images)).all(), name
+    return ""
+
+
+QUICK = ("timed_sunsky", "sunsky", "rawconstant", "blackbody", "projector", "measured")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(QUICK, id="some"),
+        pytest.param(sorted(PLUGINS.keys() - set(QUICK)), id="others", marks=pytest.mark.slow),
+    ],
+)
+def test_every_plugin_of_the_wheel_renders_or_is_refused_in_one_line(names: Sequence[str], tmp_path: Path) -> None:
+    """As in RGB variants. timed_sunsky, sunsky and rawconstant ended in tracebacks."""
+    lines = {name: _refused(name, tmp_path) for name in names}
+    known = {
+        "timed_sunsky": "give a sunsky in its place",
+        "rawconstant": "rawconstant of",
+        "sunsky": "",
+        "blackbody": "",
+    }
+    assert {name: line for name, line in known.items() if line not in lines.get(name, line)} == {}
+    assert [name for name in ("sunsky", "blackbody", "projector", "bitmap", "perspective") if lines.get(name)] == []

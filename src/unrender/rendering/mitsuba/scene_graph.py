@@ -253,13 +253,10 @@ def _visitor(_variant: str) -> type:
 Holders = Mapping[Any, list[tuple[Any, str]]]
 """{object: (object that holds it, name of the slot)}, one pair per path to it."""
 
-_SPECTRAL_ONLY = {
-    "RegularSpectrum": "regular",
-    "IrregularSpectrum": "irregular",
-    "BlackBodySpectrum": "blackbody",
-    "TimedSunskyEmitter": "timed_sunsky",
-}
+_SPECTRAL_ONLY = {"RegularSpectrum": "regular", "IrregularSpectrum": "irregular", "BlackBodySpectrum": "blackbody"}
 """{class: plugin} of plugins that Mitsuba loads in RGB variants but cannot evaluate there."""
+_TIMED_SKY = "TimedSunskyEmitter"
+"""Class of an emitter that Mitsuba loads but cannot evaluate in loops, in any variant."""
 _PRIMITIVE_FIELD = "BasicVolumetricPrimitiveRadianceFieldIntegrator"
 
 
@@ -269,14 +266,13 @@ def refusal(scene: Any, objects: Iterable[Any]) -> str:
     This function does not raise: an exception would keep the scene alive, and virtual calls reach all living objects.
     """
     names = {class_name(node) for node in objects}
-    spectral = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
+    variant = str(mi.variant())
+    if _TIMED_SKY in names:
+        return f"Mitsuba cannot evaluate the plugin timed_sunsky in the variant {variant}; give a sunsky in its place"
+    spectral = "" if variant.endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
     if spectral:
-        plugin = _SPECTRAL_ONLY[spectral]
-        variant = str(mi.variant())
-        instead = "give a sunsky in its place"
-        if plugin != "timed_sunsky":
-            instead = f"use the variant {variant.replace('rgb', 'spectral')}, or give an rgb colour in its place"
-        return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {variant}; {instead}"
+        instead = f"use the variant {variant.replace('rgb', 'spectral')}, or give an rgb colour in its place"
+        return f"Mitsuba cannot evaluate the plugin {_SPECTRAL_ONLY[spectral]} in the variant {variant}; {instead}"
     if type(scene.integrator()).__name__ == _PRIMITIVE_FIELD:
         return (
             "the integrator volprim_rf_basic renders ellipsoids as a radiance field, but path tracing treats them as surfaces; "

@@ -68,6 +68,8 @@ def refusal(scene: Any, holders: Holders) -> str:
         used = next((slot for _, slot in slots if slot not in _NUMBERS), "")
         if used and is_raw(node) and channels(mi.traverse(node)["data"]) != 1:
             return f"the bitmap of {used} is raw, and spectral variants do not upsample raw colours; set raw to false"
+        if used and name == "RawConstantTexture" and channels(mi.traverse(node)["value"]) != 1:
+            return f"the rawconstant of {used} holds coordinates, of which spectral variants make no spectrum; give an rgb colour"
         if used and _holds_colours(node):
             return f"the data of the bitmap of {used} are colours, which Mitsuba takes for coefficients; give bitmap = mitsuba.Bitmap(...)"
     for sensor in scene.sensors():

@@ -223,7 +223,7 @@ class EmitterConnection:
         edge &= self.active
         radiance = ds.emitter.eval_direction(vertex, self._seen, edge)
         factor = dr.clip(weight * ds.pdf / radiance, 0, 2)
-        self._factor = dr.select(edge & (radiance != 0), factor, 1)
+        self._factor = mi.Spectrum(dr.select(edge & (radiance != 0), factor, 1))
 
     @property
     def emitter(self) -> UInt32:
