@@ -344,6 +344,15 @@ def test_a_texture_that_an_expression_turns_into_a_roughness_has_no_map(text: st
     assert not of.renderer.parameters()[passed].curved
 
 
+def test_expressions_stand_beside_ties_and_unknowns_of_photographs() -> None:
+    """Both have names that the scene lacks and no expression reads, and were refused as unknowns that nothing reads."""
+    tie = ur.Parameter("shift", keys=["left.translation.y", "right.translation.y"], initial=0.25)
+    made = problem(picture(), LAMPS, ur.Parameter("strength", initial=2.0), tie, ur.Parameter("exposure"))
+    at = {"left.translation.y": 0.25, "right.translation.y": 0.25}
+    alone = ur.Problem(scene, [ur.Parameter(key, initial=x) for key, x in at.items()], [ur.View(picture())])
+    np.testing.assert_allclose(ur.render(made, spp=8), ur.render(alone, spp=8), rtol=1e-4)
+
+
 def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
     """Its projection was not evaluated before the functions of it, which gave it their size."""
     unknown = ur.Parameter("strength", initial=1.0, bounds=(0.1, 10.0))

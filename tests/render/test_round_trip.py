@@ -9,11 +9,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import unrender as ur
 from tests import asset_readers
 from unrender.app.evaluation.measures import measure
-from unrender.rendering.mitsuba import turntable_light
 
 pytest.importorskip("trimesh")
 pytest.importorskip("pygltflib")
@@ -42,10 +42,10 @@ def cameras(problem: ur.Problem) -> tuple[list[Any], np.ndarray]:
     renderer: Any = problem.renderer
     scene = renderer.pair.current
     sensors = [scene.sensors()[view.sensor] for view in problem.views]
-    lights = [light for light in scene.emitters() if turntable_light.is_turntable(light)]
-    turns = turntable_light.turns(lights[0]) if lights else None
-    times = [round(float(sensor.shutter_open())) for sensor in sensors]
-    return sensors, np.array([np.eye(3) if turns is None else turns[time] for time in times])
+    described: Any = mi.traverse(mi.load_file(str(problem.origin["scene"])))  # pyright: ignore
+    base = np.array(described["light.to_world"].matrix, float).reshape(4, 4)[:3, :3]
+    known = [(view.known or {}).get("light.rotation", [0.0, 0.0, 0.0]) for view in problem.original_views]
+    return sensors, Rotation.from_rotvec(known).as_matrix() @ base
 
 
 def pictures(kind: str, folder: Path, held_out: ur.Problem, spp: int) -> list[np.ndarray]:
@@ -58,6 +58,10 @@ def pictures(kind: str, folder: Path, held_out: ur.Problem, spp: int) -> list[np
     for index, (sensor, turn) in enumerate(zip(sensors, turns, strict=True)):
         if looks is not None and (index == 0 or not np.array_equal(turn, turns[index - 1])):
             scene = mi.load_dict(asset_readers.described(looks, folder / "environment.exr", turn))
+        elif looks is None:
+            parameters: Any = mi.traverse(scene)
+            parameters["light.to_world"] = mi.Transform4f(np.pad(turn, (0, 1)) + np.diag([0.0, 0.0, 0.0, 1.0]))
+            parameters.update()
         image = mi.render(scene, sensor=sensor, integrator=path, spp=spp, seed=mi.UInt32(1))  # pyright: ignore
         found.append(np.array(image)[..., :3])
     return found

@@ -15,7 +15,6 @@ from kernels import count_recordings
 from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
 from unrender.rendering.mitsuba.path_cache import session as caching
 from unrender.rendering.mitsuba.path_cache import tracing
@@ -23,6 +22,7 @@ from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.path_cache.tracing import Lookups
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.turns import Turns
 
 FLOOR, BALL, LAMP = "floor.bsdf.reflectance.data", "ball.bsdf.reflectance.data", "lamp.emitter.radiance.value"
 
@@ -119,10 +119,10 @@ def prepared(name: str) -> tuple[CachingSession, dict[str, Any], dict[str, Any]]
 
 
 def states(
-    make: Callable[[], dict[str, Any]], keys: tuple[str, ...]
+    make: Callable[[], dict[str, Any]], keys: tuple[str, ...], turns: Turns | None = None
 ) -> tuple[CachingSession, dict[str, Any], dict[str, Any]]:
     """See `prepared`."""
-    renderer = MitsubaRenderer(make, zoo.DEPTH)
+    renderer = MitsubaRenderer(make, zoo.DEPTH, turns=turns)
     session = renderer.prepare(list(keys), "path")
     assert isinstance(session, CachingSession)
     current = renderer.values(list(keys))
@@ -296,20 +296,21 @@ def test_two_sides_of_different_materials_and_what_moves_are_not_served() -> Non
                 Lookups(renderer.pair, [key])
 
 
-def turntable() -> dict[str, Any]:
-    """An environment map that a light of another class turns."""
-    turntable_light.register()
-    described = zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)})
-    described["sky"] = {"type": "turntable", "turns": "1 0 0 0, 0.7 0.7 0 0", "map": described["sky"]}
-    return described
+def under_sky() -> dict[str, Any]:
+    """A scene under an environment map."""
+    return zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)})
+
+
+TURNED = Turns((0,), (("sky", ((1.5, 0.0, 0.0),)),))
+"""A light of another class turns the map."""
 
 
 def test_a_light_that_another_holds_is_not_served() -> None:
     """Paths meet the outer light, so the inner one would never be looked up."""
-    renderer = MitsubaRenderer(turntable, zoo.DEPTH)
-    with pytest.raises(InputError, match=r"sky\.map\.data: it is inside"):
-        Lookups(renderer.pair, ["sky.map.data"])
-    assert not isinstance(renderer.prepare(["sky.map.data", FLOOR], "path"), CachingSession)
+    renderer = MitsubaRenderer(under_sky, zoo.DEPTH, turns=TURNED)
+    with pytest.raises(InputError, match=r"sky\.data: it is inside"):
+        Lookups(renderer.pair, ["sky.data"])
+    assert not isinstance(renderer.prepare(["sky.data", FLOOR], "path"), CachingSession)
     assert isinstance(renderer.prepare([FLOOR], "path"), CachingSession)
 
 
@@ -317,7 +318,7 @@ def test_a_light_that_another_holds_is_not_served() -> None:
 def test_a_light_that_is_never_looked_up_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracing, "_check_around", lambda owner, around: None)
     with pytest.raises(AssertionError, match="Not equal"):
-        compare(*states(turntable, ("sky.map.data", FLOOR)))
+        compare(*states(under_sky, ("sky.data", FLOOR), TURNED))
 
 
 def test_a_texture_that_a_plugin_may_hold_unseen_is_not_served() -> None:

@@ -91,10 +91,11 @@ def _take(problem: Problem) -> dict[str, str]:
         if not view.own_world:
             continue
         world = _world(problem, index)
-        fields = {f"known {key}": _of_array(x) for key, x in sorted(world.values.items())}
+        values = view.known or {} if world is None else world.values
+        fields = {f"known {key}": _of_array(np.asarray(x, np.float32)) for key, x in sorted(values.items())}
         if isinstance(view.scene, (str, Path)):
             fields["scene"] = str(Path(view.scene).resolve())
-        elif view.scene is not None:
+        elif view.scene is not None and world is not None:
             fields["scene"] = digest(*(part for parts in _objects(world.renderer).values() for part in parts))
         fields |= {} if view.aov is None else {"aov": view.aov}
         parts |= {f"view {index}: {name}": value for name, value in fields.items()}
@@ -112,10 +113,10 @@ def _of_scene(problem: Problem) -> dict[str, str]:
     return {f"scene: {name}": digest(*parts) for name, parts in objects.items()}
 
 
-def _world(problem: Problem, view: int) -> World:
-    """Return the world of a view that has its own."""
-    worlds = next(layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer))
-    return worlds.state_of(problem.views[view].sensor)
+def _world(problem: Problem, view: int) -> World | None:
+    """Return the world of a view that has its own; None if it only turns lights."""
+    worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
+    return None if worlds is None else worlds.state_of(problem.views[view].sensor)
 
 
 def _objects(renderer: Renderer, without: Container[str] = ()) -> dict[str, list[bytes]]:

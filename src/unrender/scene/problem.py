@@ -383,9 +383,8 @@ def open_scene(
     functions = expressions or {}
     renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])
     try:
-        renderer = with_expressions(
-            renderer, functions, {p.key: p.initial for p in parameters if isinstance(p.key, str)}
-        )
+        own = [p for p in parameters if isinstance(p.key, str) and p.keys is None and p.key not in OF_PHOTOGRAPHS]
+        renderer = with_expressions(renderer, functions, {p.key: p.initial for p in own})
     except KeyedError as error:
         raise FieldError(("expressions", error.key), str(error), f"expression of {error.key}") from error
     except InputError as error:

@@ -14,10 +14,11 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.io import parameter_values
 from unrender.io.toml_lines import FieldError
-from unrender.rendering.expressions import are_storable
+from unrender.rendering.expressions import are_storable, expression_layer
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.rendering.turns import TurnsLights, turns_of, with_scene
 from unrender.rendering.worlds import World, with_worlds
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_sensor
@@ -42,19 +43,23 @@ def of_views(
     Raises:
         FieldError: a sensor, key or value is invalid, or a scene has none of the unknowns.
     """
+    renderer, sensors = _turned(renderer, views, keys)
+    if sensors:
+        return renderer, tuple(
+            replace(view, sensor=sensor, known=None) for view, sensor in zip(views, sensors, strict=True)
+        )
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}
     for index, view in enumerate(views):
         own = scene_renderer(renderer)
         if not view.own_world:
-            check_sensor(index, view, len(own.resolutions()))
             continue
         if view.scene is not None:
             own = next((made for scene, made in scenes if scene is view.scene or _equal(scene, view.scene)), None)
             if own is None:
                 own = _opened(index, view, keys, scene_renderer(renderer), opened)
                 scenes.append((view.scene, own))
-        check_sensor(index, view, len(own.resolutions()))
+            check_sensor(index, view, len(own.resolutions()))
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
         worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
@@ -64,6 +69,27 @@ def of_views(
         replace(view, sensor=located[index], known=None, scene=None, aov=None) if index in located else view
         for index, view in enumerate(views)
     )
+
+
+def _turned(renderer: Renderer, views: Sequence[View], keys: Sequence[str]) -> tuple[Renderer, list[int]]:
+    """Return a renderer in which each view is a sensor, and these sensors, if views differ by rotations of distant lights alone.
+
+    Otherwise the lights are as described, and there are no sensors.
+    """
+    own = scene_renderer(renderer)
+    turns = own.turns if isinstance(own, TurnsLights) else None
+    count = len(set(turns.sensors)) if turns else len(own.resolutions())
+    for index, view in enumerate(views):
+        if view.scene is None:
+            check_sensor(index, view, count)
+    if not isinstance(own, TurnsLights):
+        return renderer, []
+    alike = all(view.scene is None and view.aov is None and isinstance(view.known or {}, Mapping) for view in views)
+    layer = expression_layer(renderer)
+    used = [*keys, *(() if layer is None else (one.key for one in layer.expressions))]
+    found = turns_of(own, count, [(view.sensor, view.known or {}) for view in views], used) if alike else None
+    turned = own.with_turns(None if found is None else found[0], used)
+    return renderer if turned is own else with_scene(renderer, turned), [] if found is None else found[1]
 
 
 def is_storable(renderer: Renderer, views: Sequence[View]) -> bool:

@@ -31,7 +31,6 @@ from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.losses.metrics import srgb
 from unrender.rendering.exposure import EXPOSURE
-from unrender.rendering.mitsuba import turntable_light
 
 _SHADOW = 0.1
 """Fraction of a pixel's maximum brightness below which it may be in shadow."""
@@ -160,8 +159,8 @@ _KEYS = {
 }
 _BRIGHTEST = 0.8
 """Reflectance of the 99th percentile of brightness."""
-_FAR, _DISTANCE = 1e4, 100.0
-"""Distances of the light, and of the camera in half plate widths: nearly orthographic, with a sensor that recorded kernels support."""
+_DISTANCE = 100.0
+"""Distance of the camera in half plate widths: nearly orthographic, with a sensor that recorded kernels support."""
 
 
 def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> None:
@@ -197,26 +196,24 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
     (folder / writing.SCENE).write_bytes(_scene(views, strength))
     writing.write_mask(inside, folder / writing.MASKS / "mask.png")
     listed = []
+    known = writing.turned_light(np.array([_towards(direction) for direction in views.directions]))
     for index, (photograph, values) in enumerate(zip(views.names, views.values, strict=True)):
         file = f"{writing.REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
         images.write(values, folder / file, half=True)
-        listed.append(
-            (views.held_out[index], {"reference": file, "sensor": index, "mask": f"{writing.MASKS}/mask.png"})
-        )
+        fields = {"reference": file, "sensor": index, "mask": f"{writing.MASKS}/mask.png"}
+        listed.append((views.held_out[index], fields | known[index]))
     unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in chosen]
     writing.write_problems(folder, name, listed, unknowns, "L1", 2)
 
 
 def _scene(views: LitViews, strength: float) -> bytes:
-    """Return the scene. The camera looks along -z at a plate of width 2; each light has its own sensor, distinguished by time."""
+    """Return the scene under the first light. The camera looks along -z at a plate of width 2; each photograph has its own sensor."""
     root = Xml.Element("scene", version="3.0.0")
     height, width = views.mask.shape
     for index, photograph in enumerate(views.names):
         sensor = Xml.SubElement(
             root, "sensor", type="perspective", id=f"light-{index:04d}-{file_name(Path(photograph).stem)}"
         )
-        for name in ("shutter_open", "shutter_close"):
-            writing.add_value(sensor, "float", name, float(index))
         writing.add_value(sensor, "string", "fov_axis", "x")
         writing.add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(1 / _DISTANCE)))
         transform = Xml.SubElement(sensor, "transform", name="to_world")
@@ -229,12 +226,10 @@ def _scene(views: LitViews, strength: float) -> bytes:
     writing.add_value(normal, "boolean", "use_shadowing_function", "false")
     writing.add_texture(normal, "normalmap", _NORMAL, raw=True, pixels=True)
     writing.add_texture(Xml.SubElement(normal, "bsdf", type="diffuse"), "reflectance", _COLOUR, raw=True, pixels=True)
-    light = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
-    writing.add_value(light, "string", "turns", turntable_light.text(np.array([_towards(d) for d in views.directions])))
-    writing.add_value(light, "float", "distance", _FAR)
-    lamp = Xml.SubElement(light, "emitter", type="directional", name="map")
-    Xml.SubElement(lamp, "vector", name="direction", x="0", y="0", z="-1")
-    Xml.SubElement(lamp, "rgb", name="irradiance", value=repr(np.pi * strength))
+    light = Xml.SubElement(root, "emitter", type="directional", id="light")
+    x, y, z = (repr(-float(number)) for number in views.directions[0])
+    Xml.SubElement(light, "vector", name="direction", x=x, y=y, z=z)
+    Xml.SubElement(light, "rgb", name="irradiance", value=repr(np.pi * strength))
     return writing.encoded(root)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -21,7 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.core.text import printable
 from unrender.io import images
-from unrender.rendering.mitsuba import turntable_light
 
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
@@ -61,7 +61,8 @@ def write(
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
-    (folder / writing.SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
+    turns = light_turns(np.array([view.camera_to_world for view in views])) if turntable else None
+    (folder / writing.SCENE).write_bytes(_scene(views, stems, mesh, chosen, None if turns is None else turns[0]))
     for part in _FOLDERS:
         (folder / part).mkdir()
     level, clipped, brightest = [], False, 0.0
@@ -81,19 +82,22 @@ def write(
     # Values above 1 cannot come from files of 8 or 16 bits.
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
-    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
-    listed = [
-        (
-            view.held_out,
-            {"reference": f"{writing.REFERENCES}/{stem}.exr", "sensor": i, "mask": f"{writing.MASKS}/{stem}.png"},
-        )
-        for i, (view, stem) in enumerate(zip(views, stems, strict=True))
-    ]
+    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))))
+    listed = _listed(views, stems, [{}] * len(views) if turns is None else writing.turned_light(turns))
     writing.write_problems(folder, name, listed, tables, loss, _MAX_DEPTH)
     note = "Each stage starts from the result of the previous stage. Run all: unrender run stages.toml"
-    stages = unknowns.stages(chosen, Path(writing.PROBLEM), turntable)
+    stages = unknowns.stages(chosen, Path(writing.PROBLEM))
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
+
+
+def _listed(views: CapturedViews, stems: Sequence[str], known: Sequence[dict[str, Any]]) -> list[tuple[bool, dict]]:
+    """Return whether each view is held out, and its table in the problem file, which includes `known`."""
+    listed = []
+    for index, (view, stem, own) in enumerate(zip(views, stems, known, strict=True)):
+        reference, mask = f"{writing.REFERENCES}/{stem}.exr", f"{writing.MASKS}/{stem}.png"
+        listed.append((view.held_out, {"reference": reference, "sensor": index, "mask": mask} | own))
+    return listed
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
@@ -130,36 +134,27 @@ def _banded(mask: np.ndarray, band: int) -> np.ndarray:
     return np.where(mask, np.where(inner, 1.0, _BAND_WEIGHT), 0.0).astype(np.float32)
 
 
-def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Sequence[str], turntable: bool) -> bytes:
+def _scene(
+    views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Sequence[str], turn: np.ndarray | None
+) -> bytes:
+    """Return the scene. `turn` is the rotation (3, 3) of the light's map, None for none."""
     root = Xml.Element("scene", version="3.0.0")
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
     distances = [float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0))) for view in views]
     # Equal values for all cameras avoid one kernel per camera when views are rendered one by one.
     clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
-    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
-        sensor = sensor_element(view, stem, *clip)
-        for name in ("shutter_open", "shutter_close") if turntable else ():
-            writing.add_value(sensor, "float", name, float(index))
-        root.append(sensor)
+    for view, stem in zip(views, stems, strict=True):
+        root.append(sensor_element(view, stem, *clip))
     shape = Xml.SubElement(root, "shape", type="ply", id="asset")
     writing.add_value(shape, "string", "filename", MESH)
     _material(shape, chosen)
-    _light(root, views, radius, turntable)
-    return writing.encoded(root)
-
-
-def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
-    """Add an environment map; for a turntable, one that rotates with the cameras."""
-    if turntable:
-        root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
-        turns = light_turns(np.array([view.camera_to_world for view in views]))
-        writing.add_value(root, "string", "turns", turntable_light.text(turns))
-        writing.add_value(root, "float", "distance", 1e4 * radius)
-        light = Xml.SubElement(root, "emitter", type="envmap", name="map")
-    else:
-        light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    light = Xml.SubElement(root, "emitter", type="envmap", id="light")
     writing.add_value(light, "string", "filename", LIGHT)
+    if turn is not None:
+        transform = Xml.SubElement(light, "transform", name="to_world")
+        Xml.SubElement(transform, "matrix", value=" ".join(map(repr, turn.ravel().tolist())))
+    return writing.encoded(root)
 
 
 def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:

@@ -71,8 +71,8 @@ def parse(text: str) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in names)
 
 
-def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
-    """Return {name: the parameter's key} of all names. A normal map nests the material, and a turntable nests the light's map."""
+def keys(unknowns: Sequence[str]) -> dict[str, str]:
+    """Return {name: the parameter's key} of all names. A normal map nests the material."""
     material = "asset.bsdf.nested_bsdf" if "normal" in unknowns else "asset.bsdf"
     return {
         "colour": f"{material}.base_color.data",
@@ -80,7 +80,7 @@ def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
         "metallic": f"{material}.metallic.data",
         "normal": "asset.bsdf.normalmap.data",
         "shape": "asset.vertex_positions",
-        "light": "light.map.data" if turntable else "light.data",
+        "light": "light.data",
         "exposure": EXPOSURE,
         "vignetting": VIGNETTING,
         "response": RESPONSE,
@@ -88,9 +88,9 @@ def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
     }
 
 
-def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False) -> list[dict[str, Any]]:
+def parameters(unknowns: Sequence[str], diagonal: float) -> list[dict[str, Any]]:
     """Return the [[parameters]] of a problem file. `diagonal` is that of the mesh's bounding box, > 0."""
-    of = keys(unknowns, turntable)
+    of = keys(unknowns)
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
         "colour": unit,
@@ -123,13 +123,13 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
     return textures_by_name
 
 
-def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
+def stages(unknowns: Sequence[str], problem: Path) -> Stages:
     """Return the stages: materials and light at low resolution, then at full resolution, normals, detail of all, and the shape.
 
     Unknowns of earlier stages remain active, with smaller rates from the normals on and with less gradient smoothing at the end. Poses
     are active from the second stage on, since they require a texture.
     """
-    of, result = keys(unknowns, turntable), []
+    of, result = keys(unknowns), []
     moved: list[str] = []
 
     def add(

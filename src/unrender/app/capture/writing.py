@@ -53,6 +53,14 @@ def write_problems(
             (folder / file).write_text(text, encoding="utf-8")
 
 
+def turned_light(rotations: np.ndarray) -> list[dict[str, Any]]:
+    """Return the fields of views with which the light has these rotations (N, 3, 3), where the scene's light has the first."""
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(rotations @ rotations[0].T).as_rotvec()
+    return [{"with": {"light.rotation": vector.tolist()}} for vector in vectors]
+
+
 def encoded(scene: Xml.Element) -> bytes:
     """Return a scene as an XML file."""
     Xml.indent(scene)

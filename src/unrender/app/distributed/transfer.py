@@ -47,7 +47,8 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     located_views = [_located(problem.original_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
-    if sensors is not None and any(view.own_world for view in problem.original_views):
+    moved = any(view.sensor != own.sensor for view, own in zip(problem.views, problem.original_views, strict=True))
+    if sensors is not None and moved:
         raise InputError(
             f"workers: {problem.name} has camera parameters of photographs and views of different scenes, which workers do not "
             "support together; leave --workers out"

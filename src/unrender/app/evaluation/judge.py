@@ -236,7 +236,7 @@ def _render(
         scene = scenes.load_scene(path, light, up)
         sensors = scene.sensors()
         with phases.phase("other light") as advance:
-            for index, view in enumerate(problem.views):
+            for index, view in enumerate(problem.original_views):
                 relit.append(scenes.render(scene, sensors[view.sensor], spp, problem.max_depth)[..., :3])
                 advance((index + 1) / len(problem.views))
     return images, relit, _albedo(problem, values, truth, path, scratch)

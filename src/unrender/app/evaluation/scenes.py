@@ -64,8 +64,7 @@ def read_light(path: Path) -> np.ndarray:
 def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray | None = None) -> Any:
     """Load a scene file, optionally with another light.
 
-    Another light removes the shutter times of the sensors: these are the times of a turntable, and Mitsuba compiles a kernel for each.
-    Films become RGB.
+    With another light, films become RGB.
 
     Args:
         path: a scene file of `export_scene`.
@@ -77,10 +76,6 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
     root = Xml.parse(path).getroot()
     for emitter in root.findall("emitter"):
         root.remove(emitter)
-    for sensor in root.findall("sensor"):
-        for name in ("shutter_open", "shutter_close"):
-            for value in sensor.findall(f"float[@name='{name}']"):
-                sensor.remove(value)
     for name in root.iterfind("sensor/film/string[@name='pixel_format']"):
         name.set("value", "rgb")
     file = path.parent / "other-light.exr"

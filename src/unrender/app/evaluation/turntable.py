@@ -15,7 +15,6 @@ import numpy as np
 from PIL import Image
 
 from unrender.app.evaluation import scenes
-from unrender.app.exporting.asset import read_environment
 from unrender.backend import variant
 from unrender.core import phases
 from unrender.core.errors import InputError
@@ -24,7 +23,6 @@ from unrender.core.rotations import rotation
 from unrender.display.pictures import quantized
 from unrender.io import files
 from unrender.losses.metrics import exposure, srgb
-from unrender.rendering.mitsuba import turntable_light
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 from unrender.scene.problem import Problem
@@ -118,8 +116,6 @@ def turntable(
         table = _table(scene, axis, problem.name)
         if light is not None:
             scene = scenes.load_scene(path, light, scenes.turned_up(axis))
-        elif any(map(turntable_light.is_turntable, scene.emitters())):
-            scene = scenes.load_scene(path, *read_environment(scene, []))
         if notify is not None and (turning := sorted({each.class_name() for each in scene.emitters()} - _STANDING)):
             notify(f"{', '.join(turning)}: turns with the scene; only environment maps stand still, see --environment")
         pictures = _frames(scene, table, frames, size, spp, elevation, problem.max_depth, BACKGROUNDS[background])

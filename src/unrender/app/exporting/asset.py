@@ -16,7 +16,7 @@ import numpy as np
 
 from unrender.app.exporting.materials import Material, check_size, read_material
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import mesh_layout, turntable_light
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.description import load
 
 _CONSTANT_SIZE = (16, 32)
@@ -156,20 +156,16 @@ def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np
 def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
     """Return the environment map of a live scene and its rotation, as in `Asset`. Append a line to `notices` for each other light.
 
-    The map of a turntable has its orientation at the first camera. Raises `InputError` if the map is too large.
+    Raises `InputError` if the map is too large.
     """
     environment, to_world = None, np.eye(3)
     for emitter in scene.emitters():
-        before = np.eye(3)
-        if turntable_light.is_turntable(emitter):
-            notices.append(f"{emitter.id() or 'light'}: a turntable's, as it stood before the first camera")
-            before, emitter = turntable_light.turns(emitter)[0], emitter.map
         values: Any = mi.traverse(emitter)
         if emitter.class_name() == "EnvironmentMapEmitter":
             pixels = np.array(values["data"])[:, 1:-1, :3]  # without the columns that Mitsuba repeats
             check_size("environment map", pixels)
             environment = np.ascontiguousarray(pixels * float(np.array(values["scale"]).ravel()[0]), np.float32)
-            to_world = before @ np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+            to_world = np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
         elif emitter.class_name() == "ConstantBackgroundEmitter" and "radiance.value" in values:
             radiance = np.broadcast_to(np.array(values["radiance.value"], np.float32).ravel(), (3,))
             environment = np.broadcast_to(radiance, (*_CONSTANT_SIZE, 3)).copy()

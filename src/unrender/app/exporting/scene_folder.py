@@ -269,7 +269,7 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
         integrator["hide_emitters"] = True
     films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
     # Of the references, which stages compare with this scene.
-    formats = dict(zip(films, renderer.formats(), strict=True))
+    formats = dict(zip(films, renderer.formats()[: len(films)], strict=True))
     for index in graph.of(mi.ObjectType.Sensor):
         graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
         film = films[f"n{index}"]

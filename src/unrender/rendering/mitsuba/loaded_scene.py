@@ -32,7 +32,9 @@ from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, refusal, replace_meshes
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
+from unrender.rendering.mitsuba.turned_lights import with_turns
 from unrender.rendering.renderer import ReplacedMesh
+from unrender.rendering.turns import Turns
 
 
 class _Registry:
@@ -135,6 +137,7 @@ class LoadedScene:
         description: what to load.
         moving: ids of shapes that move; spheres among them become meshes.
         replaced: {id of a shape: its new mesh}.
+        turns: rotations of its lights for each sensor; None for the scene as described.
 
     Attributes:
         scene: the `mitsuba.Scene`.
@@ -153,14 +156,14 @@ class LoadedScene:
         description: SceneDescription,
         moving: AbstractSet[str] = frozenset(),
         replaced: Mapping[str, ReplacedMesh] | None = None,
+        turns: Turns | None = None,
     ):
         self.scene, self.source, self.equal = load_resolved(description)
         self.variant = mi.variant()
         self._shared = is_loaded(description)
-        self.meshed: list[str] = []
-        if moving and not self._shared:
-            self.scene, self.meshed = meshed(self.scene, moving)
+        self.scene, self.meshed = meshed(self.scene, moving) if moving and not self._shared else (self.scene, [])
         replace_meshes(self.scene, replaced or {})
+        self.scene = with_turns(self.scene, turns, description)
         self.graph = ObjectGraph(self.scene)
         if reason := refusal(self.scene, self.graph.nodes) or spectral_colours.refusal(self.scene, self.graph.slots):
             del self.scene, self.graph

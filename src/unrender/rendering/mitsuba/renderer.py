@@ -15,7 +15,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import gpu, poses
+from unrender.rendering.mitsuba import gpu, poses, turned_lights
 from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.geometry_notices import contact_notices, specular_notices
@@ -47,6 +47,7 @@ from unrender.rendering.renderer import (
     Space,
     differentiated,
 )
+from unrender.rendering.turns import Turns
 
 
 class MitsubaRenderer:
@@ -58,6 +59,7 @@ class MitsubaRenderer:
         max_depth: maximum path length in segments, >= 1; None for that of the scene's integrator (`LightPaths`).
         keys: parameters that will be recovered, if known. Spheres that these move become meshes, so that they have path gradients.
         replaced: {id of a shape: `ReplacedMesh`}, meshes that replace those of the description.
+        turns: rotations of distant lights for each sensor; None for the lights as described.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` states: a number is (), a colour (3,), a bitmap (H, W, C), vertex
     positions (3 V,). Moving geometry uses Mitsuba's `prb` kernel, whose gradient omits visibility. For meshes that move, by their
@@ -69,6 +71,7 @@ class MitsubaRenderer:
         joins_views: whether requests may have the seeds of several views.
         max_depth: maximum path length in segments.
         requested_depth: the argument `max_depth`.
+        turns, turnable: see `TurnsLights`.
         notices: one line for each setting of the scene that is not used.
 
     Raises `InputError` if Mitsuba refuses the description.
@@ -82,9 +85,10 @@ class MitsubaRenderer:
         max_depth: int | None = None,
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
+        turns: Turns | None = None,
     ):
         self.requested_depth, keys = max_depth, tuple(keys)
-        self.pair = ScenePair(description, moving_targets(keys), replaced)
+        self.pair = ScenePair(description, moving_targets(keys), replaced, turns)
         self.light_paths = LightPaths.of(self.pair.current, self.pair.volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
         self.notices = (
@@ -112,6 +116,10 @@ class MitsubaRenderer:
             )
             for key, pose in self._poses.items()
         }
+        self.turns, self.turnable = turns, () if self.pair.single else turned_lights.turnable(self.pair.current)
+        names = [] if turns is None else [name for name, _ in turns.rotations]
+        self._turned = {f"{name}.rotation": poses.PoseKey(name, "rotation", None, light=True) for name in names}
+        self._info |= {key: poses.info(pose, "views know it", None) for key, pose in self._turned.items()}
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[
             tuple[tuple[str, ...], frozenset[str]], MitsubaSession | CachingSession | LuminanceSession
@@ -127,10 +135,8 @@ class MitsubaRenderer:
 
     def values(self, keys: list[str]) -> Tree:
         """Return the scene's own values, as loaded."""
-        return {
-            key: self.array(self._poses[key].loaded()) if key in self._poses else self.pair.loaded().value(key)
-            for key in keys
-        }
+        known = self._poses | self._turned
+        return {key: self.array(known[key].loaded()) if key in known else self.pair.loaded().value(key) for key in keys}
 
     def resolutions(self) -> list[tuple[int, int]]:
         """Return (height, width) of each sensor's film, after cropping."""
@@ -190,7 +196,14 @@ class MitsubaRenderer:
             return session
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
-        return MitsubaRenderer(self.pair.description, self.requested_depth, keys, self.pair.replaced | dict(meshes))
+        replaced = self.pair.replaced | dict(meshes)
+        return MitsubaRenderer(self.pair.description, self.requested_depth, keys, replaced, self.pair.turns)
+
+    def with_turns(self, turns: Turns | None, keys: Iterable[str]) -> MitsubaRenderer:
+        """Return a renderer of the scene with other rotations of distant lights for each sensor; None for the lights as described."""
+        if turns == self.turns:
+            return self
+        return MitsubaRenderer(self.pair.description, self.requested_depth, keys, self.pair.replaced, turns)
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """Return a renderer of the same loaded scenes with differential BSDF sampling; this renderer if it renders an AOV."""

@@ -20,6 +20,8 @@ from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.renderer import ReplacedMesh
 
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
+TURNED = "TurnedLight"
+"""Name of the Python class of the lights of `turned_lights.py`."""
 _ATTRIBUTE = re.compile(r'name = "(.*)",\s+scale = "(.*)"')
 
 
@@ -225,7 +227,7 @@ def _visitor(_variant: str) -> type:
             if (self.flags | flags) & mi.ParamFlags.NonDifferentiable:
                 flags &= ~mi.ParamFlags.Discontinuous
             if value is not None:
-                self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
+                self.graph.properties[self.full(name)] = value, cpptype, self.node, self.flags | flags
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
             """Add an object, immediately or deferred."""
@@ -239,15 +241,22 @@ def _visitor(_variant: str) -> type:
             self.graph.slots.setdefault(value, []).append((self.node, name))
             if value not in owners:
                 owners[value] = [self.node]
-                self.graph.hierarchy[value] = self.node, self.depth + 1
-                type(self)(self.graph, value, self.depth + 1, self._full(name), self.flags | flags).visit()
+                self.graph.hierarchy[value], full = _placed(self, name, value)
+                type(self)(self.graph, value, self.depth + 1, full, self.flags | flags).visit()
             elif self.node not in owners[value]:
                 owners[value].append(self.node)
 
-        def _full(self, name: str) -> str:
+        def full(self, name: str) -> str:
             return name if self.name is None else f"{self.name}.{name}"
 
     return Visitor
+
+
+def _placed(visitor: Any, name: str, value: Any) -> tuple[tuple[Any, int], str]:
+    """Return holder and depth of an object, and its full name. A turned light keeps those that it has in the description."""
+    if type(visitor.node).__name__ == TURNED:
+        return visitor.graph.hierarchy[visitor.node], value.id()
+    return (visitor.node, visitor.depth + 1), visitor.full(name)
 
 
 Holders = Mapping[Any, list[tuple[Any, str]]]

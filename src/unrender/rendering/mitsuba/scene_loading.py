@@ -23,7 +23,7 @@ from unrender.io import bounded_files
 from unrender.io.parameter_values import PLAIN, FileConversion
 from unrender.io.volumes import read_grid
 from unrender.rendering.mitsuba import description as loading
-from unrender.rendering.mitsuba import emissive, turntable_light
+from unrender.rendering.mitsuba import emissive
 from unrender.rendering.mitsuba.description import parse, references
 from unrender.rendering.mitsuba.scene_graph import all_shapes
 from unrender.rendering.mitsuba.spectral_colours import is_raw
@@ -54,7 +54,6 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict,
     """
     variant.ensure()
     emissive.register()
-    turntable_light.register()
     if is_loaded(description):
         return _checked_scene(description), {}, ()
     if callable(description):
@@ -81,6 +80,17 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict,
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
     outline = _outline(description) if isinstance(description, dict) else Path(description)
     return _with_sensor(scene), outline, equal
+
+
+def load_sensors(description: SceneDescription) -> list[mi.Sensor]:
+    """Return new sensors of a description that is known to load, without the rest of its scene."""
+    described: Any = description() if callable(description) else description
+    parsed = loading.parse(described if isinstance(described, dict) else Path(described))
+    nodes = parsed.state.nodes
+    for name, child in references(nodes[0].props):
+        if nodes[child].type != mi.ObjectType.Sensor:
+            del nodes[0].props[name]
+    return list(parsed.instantiate().sensors())
 
 
 def _outline(description: dict[str, Any]) -> dict[str, Any]:

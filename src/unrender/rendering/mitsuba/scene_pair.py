@@ -49,6 +49,7 @@ from unrender.rendering.mitsuba.scene_loading import (
 )
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleRequest
+from unrender.rendering.turns import Turns
 
 SINGLE = (
     "scene: a loaded mi.Scene has one state, but a control variate or meta-estimation needs two; give the .xml file or "
@@ -64,6 +65,7 @@ class ScenePair:
         description: what to load.
         moving: ids of shapes that move; spheres among them become meshes.
         replaced: {id of a shape: its new mesh}; not for a scene that the user has loaded.
+        turns: rotations of lights for each sensor, see `LoadedScene`; not for a scene that the user has loaded.
 
     Attributes:
         single: whether there is one state only, since the user has loaded the scene.
@@ -76,17 +78,18 @@ class ScenePair:
         description: SceneDescription,
         moving: AbstractSet[str] = frozenset(),
         replaced: Mapping[str, ReplacedMesh] | None = None,
+        turns: Turns | None = None,
     ):
-        self.description, self.moving, self.replaced = description, moving, dict(replaced or {})
+        self.description, self.moving, self.replaced, self.turns = description, moving, dict(replaced or {}), turns
         self.single = is_loaded(description)
         if self.single and self.replaced:
             raise InputError("meshes of a loaded scene cannot be replaced; give the .xml file or the dictionary")
-        self._current, self._previous = LoadedScene(description, moving, self.replaced), None
+        self._current, self._previous = LoadedScene(description, moving, self.replaced, turns), None
         self.volumetric = bool(media(self.current))
         known = self.volumetric and not self.single
         self._grid_transforms = extinction_transforms(self._current.source) if known else {}
         self._check_media()
-        sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
+        sizes = (sensor.film().crop_size() for sensor in self.current.sensors())
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
         self._moved: dict[frozenset[str], dict[str, Any]] = {}
@@ -104,13 +107,14 @@ class ScenePair:
         if self.single:
             raise InputError(SINGLE)
         if self._previous is None:
-            self._previous = LoadedScene(self.description, self.moving, self.replaced)
+            self._previous = LoadedScene(self.description, self.moving, self.replaced, self.turns)
             self._previous.share_values(self._current)
         return self._previous
 
     def as_described(self) -> LoadedScene:
-        """Return the first load, or a load with the original spheres if some of them became meshes."""
-        return LoadedScene(self.description, replaced=self.replaced) if self._current.meshed else self._current
+        """Return the first load, or a load with the original spheres and lights if some of them became others."""
+        changed = self._current.meshed or self.turns
+        return LoadedScene(self.description, replaced=self.replaced) if changed else self._current
 
     @property
     def current(self) -> mi.Scene:
@@ -126,11 +130,6 @@ class ScenePair:
     def current_parameters(self) -> mi.SceneParameters:
         """Parameters of the first load."""
         return self._current.parameters
-
-    @property
-    def previous_parameters(self) -> mi.SceneParameters:
-        """Parameters of the second load."""
-        return self.loaded(previous=True).parameters
 
     def clear_gradients(self) -> None:
         """Clear the gradients of all leaves of both scenes."""
@@ -151,7 +150,7 @@ class ScenePair:
         if self.single:
             raise InputError(SINGLE)
         for key in keys:
-            if self.current_parameters.properties[key][2] is self.previous_parameters.properties[key][2]:
+            if self.current_parameters.properties[key][2] is self.loaded(previous=True).parameters.properties[key][2]:
                 raise InputError(
                     f"parameter {key}: the scene dictionary holds a ready-made Mitsuba object, which two states would "
                     "share; give the scene as a function that returns the dictionary"

@@ -36,7 +36,6 @@ _DIRECT = {"RegularSpectrum": "values", "IrregularSpectrum": "values", "UniformS
 _NUMBERS = ("normalmap", "nested_texture", "opacity", "weight", "roughness", "alpha", "alpha_u", "alpha_v", "metallic")
 """Slots that may read a colour bitmap without making spectra of it."""
 _FILMS = ("HDRFilm",)
-_OTHER_PLUGINS = {"TurntableLight": "the emitter turntable_light"}
 _INSTEAD = "give the colour as a regular spectrum, whose values can be recovered"
 _ROWS = 1 << 14
 """Number of colours that are converted at once."""
@@ -60,15 +59,12 @@ def refusal(scene: Any, holders: Holders) -> str:
         return ""
     instead = f"use the variant {str(mi.variant()).replace('spectral', 'rgb')}"
     for node, slots in holders.items():
-        name = class_name(node)
         if isinstance(node, mi.Medium):
             return f"spectral variants do not support participating media; {instead}"
-        if name in _OTHER_PLUGINS:
-            return f"spectral variants do not support {_OTHER_PLUGINS[name]}; {instead}"
         used = next((slot for _, slot in slots if slot not in _NUMBERS), "")
         if used and is_raw(node) and channels(mi.traverse(node)["data"]) != 1:
             return f"the bitmap of {used} is raw, and spectral variants do not upsample raw colours; set raw to false"
-        if used and name == "RawConstantTexture" and channels(mi.traverse(node)["value"]) != 1:
+        if used and class_name(node) == "RawConstantTexture" and channels(mi.traverse(node)["value"]) != 1:
             return f"the rawconstant of {used} holds coordinates, of which spectral variants make no spectrum; give an rgb colour"
         if used and _holds_colours(node):
             return f"the data of the bitmap of {used} are colours, which Mitsuba takes for coefficients; give bitmap = mitsuba.Bitmap(...)"
