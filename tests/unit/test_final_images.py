@@ -14,6 +14,7 @@ from unittest.mock import ANY
 import drjit as dr
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from tests.analytic import AnalyticRenderer
 from unrender import losses, optimizers
@@ -510,6 +511,30 @@ def test_a_map_without_a_path_gradient_that_begins_at_its_solution_has_nothing_t
     """As in the second stage of a run, or in a run from an earlier result."""
     truth = np.random.default_rng(0).uniform(0.1, 0.9, 50)
     assert not without_gradient(half_textured(), truth + shift, (truth + shift / 2).astype(np.float32), monkeypatch)
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize(("of", "size"), [(half_textured, 50), (patterned, 100)])
+@pytest.mark.parametrize(
+    ("start", "end", "told"), [(1.0, 1.0, False), (1.0, 0.98, False), (0.0, 0.98, False), (0.0, 0.0, True)]
+)
+def test_noise_of_the_references_is_not_for_a_map_to_explain(
+    filtered: bool,
+    start: float,
+    end: float,
+    told: bool,
+    of: Callable[[], Problem],
+    size: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A map that began at its solution, or has reached it beside much noise, counted as hardly determined."""
+    truth, exact = np.random.default_rng(0).uniform(0.1, 0.9, size), np.asarray(of().views[0].reference)
+    noise = (0.2 if told else 0.6) * np.random.default_rng(7).standard_normal(exact.shape)
+    if filtered:  # as by a Gaussian filter of the film
+        noise = 3.0 * scipy.ndimage.gaussian_filter(noise, (0.5, 0.5, 0.0))
+    made = of().replaced(views=[View(exact + noise)])
+    values = [(0.5 + progress * (truth - 0.5)).astype(np.float32) for progress in (start, end)]
+    assert without_gradient(made, values[0], values[1], monkeypatch) is told
 
 
 @pytest.mark.mitsuba

@@ -35,9 +35,6 @@ _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
 _SCALE = "scale"
 """Last part of the keys of factors, such as that of an environment map."""
-_EXPLAINED, _TO_EXPLAIN = 0.2, 0.02
-"""Share of the square difference from the references that a map without a path gradient must have explained, and smallest difference
-relative to the picture, with its initial values, of which it must."""
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
 _STEP = 0.1
@@ -151,41 +148,6 @@ def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
     if bounded and change.is_below(_LEAST):
         return f"over its entire range the pictures change {less}; its value is the initial one, or noise"
     return ""
-
-
-def no_better_maps(
-    problem: Problem,
-    result: Result,
-    keys: Sequence[str],
-    ends: Sequence[Sequence[np.ndarray]],
-    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
-) -> list[str]:
-    """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
-
-    It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where the pictures with the
-    initial values agree with the references, there is nothing to explain.
-
-    Args:
-        keys: keys of textures and grids.
-        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
-        pictures: function of values and a view that returns such pictures with the same random numbers.
-    """
-    lines = []
-    judged = compares(problem) and result.verification.get("best") == "end" and len(ends[0]) > 1
-    for key in keys if judged else ():
-        state, views = {**result.parameters, key: result.initial[key]}, range(len(ends))
-        of = [
-            residuals_of_views(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
-        ]
-        first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
-        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * float(np.square(of[0][1]).mean(axis=1) @ of[0][2])
-        start, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
-        if left > max(start, least) and not left - float(last.sum()) > max(fall, _EXPLAINED * left):
-            lines.append(
-                f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
-                "it needs more steps, or fewer elements"
-            )
-    return lines
 
 
 def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:

@@ -16,7 +16,6 @@ from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import (
     common_factor,
-    no_better_maps,
     undetermined,
     undetermined_cells,
     untested_factor,
@@ -33,6 +32,7 @@ from unrender.runs.final_checks import (
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
+from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
@@ -164,7 +164,7 @@ def render_final_images(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
-            lines += _maps_without_gradient(problem, result, sensitivities, ends, samples) if spent < left() else []
+            lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
@@ -302,7 +302,7 @@ def _picture(
     return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view, (one, other)))
 
 
-def _maps_without_gradient(
+def _without_gradient(
     problem: Problem,
     result: Result,
     sensitivities: Mapping[str, np.ndarray],

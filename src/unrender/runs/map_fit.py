@@ -1,0 +1,116 @@
+"""Textures and grids without a path gradient: whether a run has brought their pictures closer to the references."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from unrender.runs.determination import changed
+from unrender.runs.result import Result
+from unrender.runs.verification import compares, residuals_of_views
+from unrender.scene.problem import Problem
+
+_ERRORS = 2.0
+"""Number of standard errors by which a change must be above 0."""
+_EXPLAINED, _TO_EXPLAIN = 0.2, 0.02
+"""Share of the square difference from the references that a map must have explained, and smallest difference relative to the picture, with
+its initial values, of which it must."""
+_BLOCKS, _CHANCE, _APART = (1, 8, 1 << 30), 7.0, 3
+"""Number of blocks of equal sign along each axis, for each tested change of a map; number of standard errors that chance does not reach,
+also where the film's filter makes noise of adjacent pixels alike; distance of compared pixels, at which no filter does."""
+
+
+def no_better_maps(
+    problem: Problem,
+    result: Result,
+    keys: Sequence[str],
+    ends: Sequence[Sequence[np.ndarray]],
+    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
+) -> list[str]:
+    """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
+
+    It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where the pictures with the
+    initial values agree with the references, there is nothing to explain. No map explains noise of the references, see `_may_explain`.
+
+    Args:
+        keys: keys of textures and grids.
+        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
+        pictures: function of values and a view that returns such pictures with the same random numbers.
+    """
+    lines = []
+    judged = compares(problem) and result.verification.get("best") == "end" and len(ends[0]) > 1
+    for key in keys if judged else ():
+        state, views = {**result.parameters, key: result.initial[key]}, range(len(ends))
+        of = [
+            residuals_of_views(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
+        ]
+        first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
+        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * float(np.square(of[0][1]).mean(axis=1) @ of[0][2])
+        start, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
+        explained = left - float(last.sum()) > max(fall, _EXPLAINED * left)
+        if (
+            left > max(start, least)
+            and not explained
+            and _may_explain(problem, result.parameters, key, of[1], pictures)
+        ):
+            lines.append(
+                f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
+                "it needs more steps, or fewer elements"
+            )
+    return lines
+
+
+def _may_explain(
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    key: str,
+    residuals_of: tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]],
+    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
+) -> bool:
+    """Return whether another map may explain the residuals: pictures change with it as the residuals do, or hardly change at all.
+
+    The products of a residual that some map removes and of changes of the pictures by random changes of the map have a sum that is not 0,
+    or pixels that are three apart share their sign. Noise of the references is independent of these changes, from pixel to pixel.
+
+    Args:
+        values: {key: array} of the residuals' pictures.
+        residuals_of: `residuals_of_views` of all views.
+        pictures: see `no_better_maps`.
+    """
+    residuals, _, weights, sizes = residuals_of
+    generator, most, shown = np.random.default_rng(0), 0.0, False
+    for blocks in _BLOCKS:
+        signs = _signs(np.shape(values[key]), blocks, generator)
+        state = {**values, key: changed(problem, key, np.asarray(values[key]), signs)}
+        views = range(len(sizes))
+        after, _, finite, _ = residuals_of_views(problem, views, [pictures(state, view) for view in views])
+        change = (after - residuals) * (finite > 0)[:, None]
+        (one, other), (first, second) = ((x[0::2].mean(axis=0), x[1::2].mean(axis=0)) for x in (residuals, change))
+        along, square = (x.sum(axis=1) * weights for x in (one * second + other * first, first * second))
+        most = max(most, abs(_score(along)), _score(_pairs(along, sizes)))
+        shown |= float(square.sum()) > _ERRORS * math.sqrt(float(np.square(square - square.mean()).sum()))
+    return most > _CHANCE or not shown
+
+
+def _score(values: np.ndarray) -> float:
+    """Return the sum of values in standard errors, if their mean is 0."""
+    return float(values.sum()) / max(math.sqrt(float(np.square(values).sum())), 1e-150)
+
+
+def _pairs(values: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return the products of the values of pixels that are three apart, from those of the pixels of all views, (N,)."""
+    ends = np.cumsum([height * width for height, width in sizes])[:-1]
+    images = [part.reshape(size) for part, size in zip(np.split(values, ends), sizes, strict=True)]
+    pairs = [[x[_APART:] * x[:-_APART], x[:, _APART:] * x[:, :-_APART]] for x in images]
+    return np.concatenate([product.ravel() for pair in pairs for product in pair])
+
+
+def _signs(shape: tuple[int, ...], blocks: int, generator: np.random.Generator) -> np.ndarray:
+    """Return random signs of this shape, equal in each of up to `blocks` blocks along each axis, and for all channels of a texture."""
+    axes = shape[:-1] if len(shape) > 2 else shape
+    counts = [min(blocks, size) for size in axes]
+    places = [np.arange(size) * count // size for size, count in zip(axes, counts, strict=True)]
+    signs = generator.choice([-1.0, 1.0], counts)[np.ix_(*places)]
+    return np.broadcast_to(signs if len(shape) < 3 else signs[..., None], shape)
