@@ -18,6 +18,7 @@ from tiers import quick
 from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba.edges import edges_of
 from unrender.rendering.mitsuba.film import views_of
 from unrender.rendering.mitsuba.geometry_terms import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
@@ -317,3 +318,17 @@ def test_a_mesh_that_views_show_in_mirrors_or_through_smooth_glass_is_told() -> 
     assert len(lines({"type": "conductor"}, below)) == 1
     assert lines({"type": "roughconductor"}, below) == lines({"type": "diffuse"}, below) == []
     assert lines({"type": "conductor"}, below.translate([9, 0, 0])) == []  # out of sight
+
+
+def test_a_seam_of_the_sphere_that_is_equal_up_to_rounding_has_no_border() -> None:
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 5)))
+    turn, tilt = 2 * np.pi * u, np.pi * v
+    points = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), -np.sin(tilt) * np.sin(turn)], -1)
+    corner = (np.arange(4)[:, None] * 9 + np.arange(8)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 9, corner + 1], -1), np.stack([corner + 1, corner + 9, corner + 10], -1)]
+    )
+    mesh = meshes.triangles("thing", points, faces, {"type": "diffuse"}, np.stack([u, v], -1))
+    edges = edges_of(mesh, None)
+    assert len(edges.always) == 72  # of 26 vertices and 48 faces
+    assert not edges.always.any()

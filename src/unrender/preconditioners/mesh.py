@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.welding import weld
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -49,8 +50,7 @@ class MeshTopology:
 
         With `welded`, vertices at the same position form one place; otherwise they are neighbours.
         """
-        _, places = np.unique(positions, axis=0, return_inverse=True)
-        places = places.reshape(-1)
+        _, places = weld(positions)
         if welded:
             return cls(places, _pairs(_edges(places[faces])))
         order = np.argsort(places, kind="stable")

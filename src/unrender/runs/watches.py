@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unrender.core import arrays, memory
+from unrender.core.welding import weld
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
 from unrender.optimizers import rates
@@ -151,8 +152,8 @@ def _joined(run: Run, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     start, end = (
         np.asarray(x).reshape(-1, 3) for x in (run.problem.unknowns[key].initial, arrays.numpy(run.parameters[key]))
     )
-    _, first, places = np.unique(start, axis=0, return_index=True, return_inverse=True)
-    return start[first], end[first], places.reshape(-1)[run.problem.faces[key]]
+    first, places = weld(start)
+    return start[first], end[first], places[run.problem.faces[key]]
 
 
 _LARGEST_STEP = 0.5

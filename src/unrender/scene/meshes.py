@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
+from unrender.core.welding import weld
 from unrender.io.toml_lines import FieldError
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.renderer import ReplacedMesh
@@ -196,8 +197,8 @@ def _check_size(faces: int) -> None:
 
 def _joined(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge vertices at the same position and drop degenerate faces; returns positions (P, 3) and faces."""
-    points, places = np.unique(positions, axis=0, return_inverse=True)
-    joined = places.reshape(-1)[faces]
+    first, places = weld(positions)
+    points, joined = positions[first], places[faces]
     nondegenerate = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
     joined = joined[nondegenerate]
     used, numbers = np.unique(joined, return_inverse=True)
@@ -274,8 +275,7 @@ def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str
         positions: vertex positions as loaded, (V, 3).
         faces: vertex indices, (F, 3).
     """
-    _, places = np.unique(positions, axis=0, return_inverse=True)
-    joined = places.reshape(-1)[faces]
+    joined = weld(positions)[1][faces]
     flat = np.linalg.norm(area_normals(positions.astype(np.float64), faces), axis=1) == 0
     sides = np.sort(joined[~flat][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     crowded = int(np.sum(np.unique(sides, axis=0, return_counts=True)[1] > 2)) if len(sides) else 0

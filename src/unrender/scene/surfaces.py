@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.welding import weld
 
 _SAMPLES = 2000
 """Number of sample points on each surface."""
@@ -265,13 +266,12 @@ def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return faces with each vertex replaced by the first vertex at its position."""
-    _, first, places = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    return first[places.reshape(-1)][faces]
+    first, places = weld(vertices)
+    return first[places][faces]
 
 
 def _at_same_place(chosen: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Extend the chosen vertices (V,) by all others at their positions, as on both sides of seams. Modifies `chosen`."""
-    _, places = np.unique(vertices, axis=0, return_inverse=True)
-    places = places.reshape(-1)
+    _, places = weld(vertices)
     chosen |= np.bincount(places, weights=chosen)[places] > 0
     return chosen

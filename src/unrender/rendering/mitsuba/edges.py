@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.welding import weld
 from unrender.rendering.mitsuba import gpu, mesh_layout
 from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, scene_of
@@ -129,8 +130,7 @@ def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     """Return the edges of a mesh, each once."""
     points = np.array(mesh_layout.positions(mesh) if positions is None else positions).reshape(-1, 3)
     faces = np.array(mesh_layout.faces(mesh)).reshape(-1, 3).astype(np.int64)
-    _, welded = np.unique(points, axis=0, return_inverse=True)
-    welded = welded.reshape(-1)
+    _, welded = weld(points)
     a, b, c = (points[faces[:, corner]].astype(float) for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     corners = welded[faces]
