@@ -332,3 +332,20 @@ def test_a_seam_of_the_sphere_that_is_equal_up_to_rounding_has_no_border() -> No
     edges = edges_of(mesh, None)
     assert len(edges.always) == 72  # of 26 vertices and 48 faces
     assert not edges.always.any()
+
+
+def test_a_mesh_whose_texture_has_jumps_is_told() -> None:
+    def lines(**texture: Any) -> list[str]:
+        points, faces = meshes.icosphere(1)
+        material = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": texture}}
+        thing = meshes.triangles("thing", 0.4 * points, faces, material, np.abs(points[:, :2]))
+        return [line for line in MitsubaRenderer(scene(thing=thing), 2, [KEY]).notices if "jumps" in line]
+
+    colours = np.random.default_rng(0).uniform(0, 1, (8, 8, 3)).astype(np.float32)
+    bitmap = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(colours)}
+    assert lines(**bitmap) == lines(**bitmap, wrap_mode="mirror") == lines(type="rgb", value=0.5) == []
+    grey = mi.Bitmap(np.full((5, 7, 3), 0.37, np.float32))
+    assert (
+        lines(**bitmap | {"bitmap": grey, "to_uv": mi.ScalarTransform4f().scale(3.1)}) == []
+    )  # it differs by rounding
+    assert len(lines(**bitmap, filter_type="nearest")) == len(lines(type="checkerboard")) == 1

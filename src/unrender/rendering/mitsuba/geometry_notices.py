@@ -12,9 +12,10 @@ import numpy as np
 from unrender.core.text import listed
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.edges import edges_of, unit
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.parameters import is_mirror_or_glass
-from unrender.rendering.mitsuba.scene_graph import has_instances, scene_of
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, attribute, has_instances, scene_of
 
 _NEAR = 1e-3
 """Distance from another shape that counts as contact, relative to the diagonal of the mesh's bounding box."""
@@ -98,6 +99,58 @@ def _seen(sensor: Any, scene: Any, meshes: list[Any]) -> np.ndarray:
         ray = mi.Ray3f(si.spawn_ray(si.to_world(bs.wo)))
         dr.eval(ray, active)
     return counts
+
+
+_PAIRS, _APART, _HALVINGS, _JUMP = 4096, 0.02, 16, 0.5
+"""Pairs of texture coordinates, their first distance, number of times that the half with the larger difference is taken, and the share of
+the first difference that remains where a texture jumps."""
+_FLAT = 1e-4
+"""First difference, relative to the largest value, up to which a texture is constant but for rounding."""
+
+
+def jump_notices(scene: Any, graph: ObjectGraph, keys: Collection[str]) -> list[str]:
+    """Return a notice about each mesh with unknown vertices whose material has a texture with jumps.
+
+    Args:
+        scene: `mi.Scene`.
+        graph: its objects.
+        keys: the unknown parameters.
+    """
+    if is_spectral():
+        return []
+    lines = []
+    for mesh in _unknown_meshes(scene, keys):
+        textures = [node for node in graph.nodes if isinstance(node, mi.Texture)]
+        own = [node for node in textures if any(mesh in chain for chain in graph.chains(node))]
+        if any(attribute(node)[0].startswith("face_") or _jumps(node) for node in own):
+            lines.append(
+                f"{mesh.id()}: a texture of its material has jumps, whose motion path gradients of its vertices omit: use bilinear "
+                "bitmaps or attributes of vertices in place of checkerboards, filter_type nearest and attributes of faces"
+            )
+    return lines
+
+
+def _jumps(texture: Any) -> bool:
+    """Return whether a checkerboard or bitmap differs as much over a tiny distance as over a short one."""
+    if not texture.class_name().startswith(("Checkerboard", "BitmapTexture")):
+        return False
+    si, generator = dr.zeros(mi.SurfaceInteraction3f, _PAIRS), np.random.default_rng(0)
+
+    def values(uv: np.ndarray) -> np.ndarray:
+        si.uv = mi.Point2f(uv.T.astype(np.float32))
+        return np.array(texture.eval(si)).reshape(-1, _PAIRS)
+
+    start, turn = generator.uniform(0.0, 1.0, (_PAIRS, 2)), generator.uniform(0.0, 2.0 * np.pi, _PAIRS)
+    end = start + _APART * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    one, other = values(start), values(end)
+    first, size = float(np.abs(other - one).max()), float(np.abs(one).max())
+    for _ in range(_HALVINGS):
+        middle = (start + end) / 2.0
+        between = values(middle)
+        near = np.abs(between - one).max(axis=0) >= np.abs(other - between).max(axis=0)
+        start, end = np.where(near[:, None], start, middle), np.where(near[:, None], middle, end)
+        one, other = np.where(near, one, between), np.where(near, between, other)
+    return first > _FLAT * size and float(np.abs(other - one).max()) > _JUMP * first
 
 
 def _unknown_meshes(scene: Any, keys: Collection[str]) -> list[Any]:
