@@ -117,6 +117,11 @@ def stays(loss: float, step: int, change: float, error: float) -> bool:
     return (1.0 - factor) * loss + factor * min(change, 0.0) > _SURE * factor * error
 
 
+def falls(loss: float, change: float | None, error: float | None) -> bool:
+    """Return whether a loss is surely far below that of an earlier step; for the arguments, see `stays`. None stands for infinity."""
+    return change is not None and error is not None and change + _SURE * error < -(1.0 - _FALLS) * (loss - change)
+
+
 def least_difference(step: int) -> float:
     """Return the smallest difference from the references that counts at the end of a run compared with `step`, relative to the image."""
     return _OF_PICTURE_SHORT if step < FIRST_CANDIDATE else _OF_PICTURE

@@ -12,10 +12,19 @@ from unrender.core import arrays
 from unrender.display import formatting
 from unrender.estimators.penalties import penalty
 from unrender.runs.determination import changed
-from unrender.runs.earlier_image import no_improvement
+from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
-from unrender.runs.verification import PRIOR, STEPS, Misfit, compares, misfit, residuals_of_views, without_prior
+from unrender.runs.verification import (
+    PRIOR,
+    STEPS,
+    Misfit,
+    as_few_samples,
+    compares,
+    misfit,
+    residuals_of_views,
+    without_prior,
+)
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import mean_square, slices_of_images
 
@@ -132,15 +141,20 @@ def loss_of_halves(
 
 
 def differs_still(
-    problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
+    problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]], spp: int
 ) -> Misfit | None:
-    """Return `no_improvement` of the halves of the final images; None if a difference is known or the images are not all."""
+    """Return `no_improvement` or, unless the loss falls, `as_few_samples` of the halves of the final images, of `spp` samples per pixel
+    together; None if a difference is known or the images are not all."""
     known = result.misfit is not None or result.verification.get("best") != "end"
     if known or len(views) < len(problem.views) or len(ends[0]) < 2:
         return None
     loss, _ = loss_of_halves(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
-    return no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
+    of = residuals_of_views(problem, views, ends)
+    difference = no_improvement(problem, change, loss, result.steps, *of)
+    if difference or not compares(problem) or falls(loss, *change.get("loss", (None, None))):
+        return difference
+    return as_few_samples(*of, spp / 2, change.get("step", 0) < FIRST_CANDIDATE)
 
 
 def with_misfit(result: Result, difference: Misfit | None) -> Result:

@@ -172,7 +172,7 @@ def render_final_images(
         deviations = {}
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
     else:
-        differs = differs_still(problem, result, chosen, ends)
+        differs = differs_still(problem, result, chosen, ends, samples)
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
     texts, errors_of = (*lines, *maps.limited), (deviations, maps.data_share, maps.missing)

@@ -41,6 +41,10 @@ _FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.05
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image; that of
 one in few pixels."""
 
+_SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 48.0, 0.03, 0.05, 3.5
+"""Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
+image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
+
 _ROWS, _PAIRS = (3, 1), (1, 0)
 """Layout for `paired_losses.systematic` of rows of pixels, and of pairs of a sample."""
 _RARE, _ERRORS = 25.0, 2.0
@@ -199,6 +203,47 @@ def misfit_of_numbers(
     )
     causes = (*causes, STEPS_OF_FEW, *([NOISE] if difference.by_pixel else []))
     return replace(difference, explanation=explanation, causes=causes)
+
+
+def as_few_samples(
+    residuals: np.ndarray,
+    references: np.ndarray,
+    weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
+    spp: float,
+    short: bool,
+) -> Misfit | None:
+    """Return a difference as large as the noise of references with few samples per pixel; None if theirs would have many.
+
+    Noise of n samples has 1/n of the variance of one sample, in every pixel. Other differences exceed it most in the half of the pixels
+    with less noise. The noise of a pixel's neighbours orders them, because that is independent of the pixel's own.
+
+    Args:
+        residuals: differences of two independent images from the references, (2, N, 3).
+        references, weights, sizes: see `misfit`.
+        spp: samples per pixel of each image.
+        short: whether the run has so few steps that its difference may still fall.
+    """
+    from scipy.ndimage import uniform_filter  # takes long to import
+
+    one, other = residuals
+    products, variances = weights * (one * other).sum(axis=1), weights * np.square(one - other).sum(axis=1) * (spp / 2)
+    images = [variances[x].reshape(size) for x, size in zip(paired_losses.slices_of_images(sizes), sizes, strict=True)]
+    around = np.concatenate([np.ravel(9.0 * uniform_filter(image, 3) - image) for image in images])
+    used = np.flatnonzero(weights)
+    quiet = used[np.argsort(around[used])[: len(used) // 2]]
+    shared, deviation = float(products[quiet].sum()), math.sqrt(float(np.square(products[quiet]).sum()))
+    error = math.sqrt(max(float(products.sum()), 0.0) / max(3.0 * float(weights.sum()), 1e-300))
+    size = math.sqrt(paired_losses.mean_square(references, weights))
+    count = float(variances[quiet].sum()) / max(shared, 1e-300)
+    large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * size
+    if not (large and shared > _SHARED * deviation and count < _SAMPLES):
+        return None
+    explanation = (
+        f", as the noise of references with {count:.2g} samples per pixel would: if they have more, the run needs more steps, or light, "
+        "depth, alignment or something else that is not among the unknowns is wrong"
+    )
+    return Misfit(error, size, 0.0, True, explanation, (STEPS, NOISE))
 
 
 def misfit_of_views(
