@@ -289,6 +289,20 @@ def test_auto_gives_poses_beside_a_texture_a_block_of_their_own() -> None:
     assert isinstance(other.perturbed, ur.SmoothedDerivatives)
 
 
+def test_textures_beside_poses_trace_no_sample_of_noise() -> None:
+    """It decides first rates of optimizers that see all unknowns, and costs an adjoint."""
+    truth = {"map": np.full((8, 8, 1), 0.6), "pose": TRUTH["pose"]}
+    renderer = PosedRenderer(truth, np.random.default_rng(1).uniform(0.0, 1.0, (48, 66)), 0.1, 0.5, shape=SHAPE)
+    views = [ur.View(renderer.exact(truth))]
+    for loss in (ur.losses.L2(), ur.losses.L1()):  # with a block, and with a smoothed loss
+        for keys, sampled in ((("map",), True), (("map", "pose"), False)):
+            asked = ur.Problem(renderer, [ur.Parameter(key, 0.5, (0, 1)) for key in keys], views, loss)
+            plan = method("auto").plan(asked).estimator
+            path = plan.path if isinstance(plan, ur.estimators.HybridGradient) else plan
+            assert isinstance(path, ur.PathGradient)
+            assert path.noise_sample == sampled
+
+
 def test_the_variance_of_what_is_perturbed_is_a_mean_square() -> None:
     """So that MetaAdam's steps are no longer than its learning rate."""
     asked = problem(noise=0.0)

@@ -178,7 +178,9 @@ def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str,
     """Return the textures that a block of lights, cameras and lenses eliminates: reflectances and radiances, in their own coordinates and
     without a prior.
 
-    Poses of shapes are visible in edges, which textures hardly explain.
+    Poses of shapes are left out. Edges show them, and where their own textures explain the rest, little but edges remains. The noise of the
+    response, which both halves of the derivative images share, then narrows the widths until all is noise: the place of a painting beside
+    its texture ended .018 away in place of .006, that of a ball .0013 in place of .0032.
     """
     unknowns, elements = plan.configured().unknowns, _elements(traits, keys)
     if not all(traits.infos[key].light or traits.infos[key].viewpoint for key in keys):

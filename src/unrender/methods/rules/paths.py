@@ -209,9 +209,9 @@ def paths(traits: Traits) -> Plan:
         f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",
     )
     fresh_from = traits.constants.fresh_from if smoothed and renders_all and not plain else 0
-    measured = renders_all and any(
-        u.initial.size >= FEWEST_ELEMENTS for key, u in problem.unknowns.items() if key in rates and key not in apart
-    )
+    # Optimizers of parts take no sample: beside poses, longer first steps of textures were as often worse as better.
+    alone = not (own or traits.block or traits.rates)
+    measured = renders_all and alone and any(problem.unknowns[key].initial.size >= FEWEST_ELEMENTS for key in rates)
     estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from, noise_sample=measured)
     return Plan(problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
 
