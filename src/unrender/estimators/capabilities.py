@@ -57,6 +57,18 @@ class FreshGradient(Capability):
 
 
 @dataclass(frozen=True)
+class GradientAtBounds(Capability):
+    """Gradient of this step's samples with respect to x, of an estimate with respect to v. It tells which elements stay at their bounds.
+
+    Attributes:
+        values: {key: array} of the parameters with bounds and a preconditioner, or of some of them.
+    """
+
+    name: ClassVar[str] = "gradient_at_bounds"
+    values: Tree
+
+
+@dataclass(frozen=True)
 class NoiseSample(Capability):
     """One sample of the gradient's noise, of mean 0 and about the gradient's variance.
 

@@ -28,7 +28,7 @@ from unrender.estimators.capabilities import (
     Variance,
 )
 from unrender.parameterisations import Transform
-from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.base import HeldElements, Preconditioner
 from unrender.scene.problem import Problem
 
 
@@ -66,13 +66,24 @@ def bounded_with_preconditioner(problem: Problem) -> tuple[str, ...]:
 def free_of_bounds(problem: Problem, parameters: Tree, mean: Tree, made: int) -> Tree:
     """Return {key: 0 for elements at a bound beyond which the loss falls, 1 for the others} of parameters with a preconditioner S.
 
-    S would spread the gradient of elements that cannot move over their neighbours. `mean`, `made`: see `AtBounds.held`.
+    `mean`, `made`: see `AtBounds.held`.
     """
     keys, repeated = bounded_with_preconditioner(problem), problem.coordinates.repeated
     means = {k: periodic.repeat(mean[k], repeated.get(k, 0)) for k in keys if k in mean}  # columns without a gradient
     at = AtBounds(lambda: {key: problem.unknowns[key].sides(parameters[key]) for key in keys})
     ones = {key: arrays.zeros_like(parameters[key]) + 1.0 for key in keys}
     return {key: arrays.where(held, 0.0 * ones[key], ones[key]) for key, held in at.held(means, made).items()}
+
+
+def with_held_elements(problem: Problem, free: Tree) -> Problem:
+    """Return the problem with `HeldElements`: those where `free` is 0. Estimators with a state in the optimizer's coordinates use it."""
+    if not free:
+        return problem
+    held = {key: HeldElements(problem.coordinates.preconditioners[key], x) for key, x in free.items()}
+    unknowns = {k: replace(u, preconditioner=held[k]) if k in held else u for k, u in problem.unknowns.items()}
+    made = problem.with_parts(unknowns=unknowns)
+    vars(made).update({k: x for k, x in vars(problem).items() if k not in vars(made) and k != "coordinates"})  # cached
+    return made
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:
@@ -168,6 +179,8 @@ def _curvature_term(gradient: Tree, problem: Problem, parameters: Tree) -> np.nd
     return _flat({key: gradient[key] * x for key, x in curvatures.items()}, parameters, missing=0.0)
 
 
+_ALONE = 0.1
+"""Size of the perturbations of elements that stay at a bound, relative to those that are smoothed: enough for the sign of a gradient."""
 _PROBES = 4
 """Number of samples that estimate the gain of S for white noise, within 5 percent for a thousand vertices."""
 
@@ -229,5 +242,7 @@ class PreconditionedPerturbations:
         return float(np.sqrt(np.mean([np.mean(self._smoothed(key, draw) ** 2) for draw in draws])))
 
     def _smoothed(self, key: str, x: Array) -> np.ndarray:
-        """Return S x on the host, in double precision."""
-        return np.asarray(self._maps[key].apply(np.asarray(x, np.float32)), np.float64)
+        """Return S x on the host, in double precision. Elements that stay at a bound are perturbed alone, which tells their gradients."""
+        S, values = self._maps[key], np.asarray(x, np.float32)
+        alone = _ALONE * (1.0 - arrays.numpy(S.free)) * values if isinstance(S, HeldElements) else 0.0
+        return np.asarray(S.apply(values), np.float64) + alone

@@ -20,9 +20,10 @@ from unrender.estimators.capabilities import (
     DerivativeImages,
     FreshGradient,
     Gradient,
+    GradientAtBounds,
     Variance,
 )
-from unrender.estimators.coordinates import by_coordinates, restricted
+from unrender.estimators.coordinates import bounded_with_preconditioner, by_coordinates, restricted
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
@@ -225,6 +226,9 @@ class HybridGradient:
             perturbed_estimate, after = self.perturbed.estimate(perturbed, part, state.perturbed, own_key)  # pyright: ignore[reportArgumentType]
             state, samples = replace(state, perturbed=after), int(perturbed_estimate.info.get("samples", 0))
         if path_estimate.preconditioned or perturbed_estimate.preconditioned:
+            bounded = bounded_with_preconditioner(problem) if not path_estimate.preconditioned else ()
+            fresh = (GradientAtBounds({name: path_estimate.gradient[name] for name in bounded}),) if bounded else ()
+            path_estimate = replace(path_estimate, capabilities=(*path_estimate.capabilities, *fresh))
             path_estimate, perturbed_estimate = (
                 by_coordinates(path_estimate, problem, parameters),
                 by_coordinates(perturbed_estimate, restricted(problem, own), part),
@@ -361,6 +365,8 @@ def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Ca
             case FreshGradient(values):
                 fresh = {key: perturbed.gradient[key] if key in own else g for key, g in values.items()}
                 merged.append(FreshGradient(fresh))
+            case GradientAtBounds(values):
+                merged.append(GradientAtBounds({key: g for key, g in values.items() if key not in own}))
             case _:
                 pass
     return (*merged, *(block for block in perturbed.capabilities if isinstance(block, BlockEstimate)))

@@ -13,7 +13,8 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Variance
+from unrender.estimators.capabilities import Capabilities, Gradient, GradientAtBounds, Variance
+from unrender.estimators.coordinates import bounded_with_preconditioner
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
 from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
 from unrender.images.plain import Plain
@@ -39,6 +40,7 @@ class MetaState:
         pixels: state of the pixel sampler.
         step: number of steps of full views; see `PairRequest.step`.
         batches: number of steps with pixel mini-batches since the last of full views.
+        free: {key: 0 for the elements that stayed at a bound in the last step, 1 for the others}, see `HeldElements`.
     """
 
     parameters: Tree | None
@@ -47,6 +49,7 @@ class MetaState:
     pixels: Any = None
     step: int = 0
     batches: int = 0
+    free: Tree = field(default_factory=dict)
 
     def starts_anew(self, parameters: Tree) -> bool:
         """Return whether no step preceded with parameters of these shapes."""
@@ -80,7 +83,7 @@ class MetaState:
             )
 
         elements = {key: element(key, old_state) for key, old_state in self.elements.items()}
-        return replace(self, parameters=before, elements=elements, image=image, pixels=pixels)
+        return replace(self, parameters=before, elements=elements, image=image, pixels=pixels, free={})
 
 
 def _distance(a: Tree, b: Tree) -> float:
@@ -233,6 +236,9 @@ class MetaEstimator:
             *observed, more, pixels = take(problem, parameters, again, pair, further, first=False)
             samples += more.samples
         rule = meta.update_coupled if self.coupled else meta.update
+        # The past has no weight where gradients of other elements were smoothed.
+        held = problem.coordinates.held
+        kept = {name: S.unchanged(state.free.get(name)) for name, S in held.items()}
         results = {
             name: rule(
                 elements[name],
@@ -242,7 +248,7 @@ class MetaEstimator:
                 beta_proportional=self.beta_proportional,
                 beta_difference=self.beta_difference,
                 clip=self.clip,
-                max_weight=self.max_weight,
+                max_weight=self.max_weight * kept.get(name, 1.0),
                 centred=self.centred,
                 decouple=self.decouple,
                 observed=None if observed is None else (observed[0][name], observed[1][name]),
@@ -253,7 +259,8 @@ class MetaEstimator:
         elements = {name: parts[3] for name, parts in results.items()}
         del first, second, observed, results
         steps = (state.step + 1, 0) if self._renders_full_views(parameters, state) else (state.step, state.batches + 1)
-        after = MetaState(parameters, elements, step.image, pixels, *steps)
+        free = {name: S.free for name, S in held.items()}
+        after = MetaState(parameters, elements, step.image, pixels, *steps, free)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
         info = {
             "samples": samples,
@@ -263,7 +270,8 @@ class MetaEstimator:
             **step.info,
         }
         loss = sum(arrays.number(value) for value in step.losses)
-        return Estimate(loss, gradient, (Variance(variance),), info, preconditioned=True), after
+        fresh = GradientAtBounds({name: step.gradient[name] for name in bounded_with_preconditioner(problem)})
+        return Estimate(loss, gradient, (Variance(variance), fresh), info, preconditioned=True), after
 
     def _space(self, problem: Problem, parameters: Tree) -> Space:
         if self.space != "auto":

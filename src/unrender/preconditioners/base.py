@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
+import numpy as np
+
 from unrender.core import arrays, periodic
 from unrender.core.arrays import Array
 from unrender.preconditioners.mesh import MeshTopology
@@ -42,6 +44,34 @@ class PeriodicPreconditioner(Protocol):
     def on_repeated(self, columns: int) -> Preconditioner:
         """Return the preconditioner for (H, W + 2 `columns`, C), where the left and right borders are neighbours."""
         ...
+
+
+@dataclass(frozen=True)
+class HeldElements:
+    """A preconditioner among the elements that may move, and 0 for those that stay at a bound.
+
+    It does not spread the gradient of elements that cannot move over their neighbours.
+
+    Attributes:
+        inner: the preconditioner S.
+        free: 0 for elements that stay, 1 for the others.
+    """
+
+    inner: Preconditioner
+    free: Array
+
+    def check(self, key: str, shape: tuple[int, ...]) -> None:
+        self.inner.check(key, shape)
+
+    def apply(self, x: Array) -> Array:
+        free = arrays.numpy(self.free) if isinstance(x, np.ndarray) else self.free
+        return free * self.inner.apply(free * x)
+
+    def unchanged(self, before: Array | None) -> Array:
+        """Return the part of each element of S x that is as with other elements held: 1 where none of its neighbours are others."""
+        moved = self.free - 1.0 if before is None else self.free - before
+        changed = moved * moved
+        return arrays.where(changed > 0.0, 0.0 * changed, arrays.maximum(1.0 - self.inner.apply(changed), 0.0))
 
 
 def bound_to(preconditioner: Any, topology: MeshTopology | None, columns: int) -> Any:

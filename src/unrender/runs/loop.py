@@ -14,8 +14,13 @@ from unrender.core.errors import InputError
 from unrender.core.random import WARM_UP, Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.estimators.coordinates import bounded_with_preconditioner, by_coordinates, free_of_bounds
+from unrender.estimators.capabilities import Capabilities, GradientAtBounds, LossFunction
+from unrender.estimators.coordinates import (
+    bounded_with_preconditioner,
+    by_coordinates,
+    free_of_bounds,
+    with_held_elements,
+)
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
@@ -115,7 +120,7 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         )
         estimate = penalized(estimate, run.problem, run.parameters)
         memory.trim_cache(run.parameters)
-        update = _apply(run, estimate)
+        update = _apply(run, estimate, {})
         run.parameters, state.optimizer = update.parameters, update.state
         del update
         memory.evaluate_in_turn(state.optimizer)
@@ -128,8 +133,10 @@ def _step(run: Run) -> dict[str, Any]:
 
     A step is not applied if its estimate is not finite, or if the optimizer's step is not finite.
     """
-    problem, state = run.problem, run.state
-    started = time.perf_counter()
+    state, started = run.state, time.perf_counter()
+    mean = run.state.noise.mean
+    free = {} if mean is None else free_of_bounds(run.problem, run.parameters, mean, run.step)
+    problem = with_held_elements(run.problem, free)
     run.estimate = None  # frees a gradient as large as the next one
     memory.trim_cache(run.parameters)
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
@@ -137,7 +144,7 @@ def _step(run: Run) -> dict[str, Any]:
     memory.trim_cache(run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:
-        update = _apply(run, estimate)
+        update = _apply(run, estimate, free)
         culprit = update.not_finite
         if not culprit:
             _warn_of_shortened(run, update.shortened)
@@ -171,9 +178,11 @@ def _step(run: Run) -> dict[str, Any]:
 
 
 def _gradient_noise(run: Run, estimate: Estimate) -> float | None:
-    """Add a gradient to the statistics, and return its fraction of noise. `_apply` uses the mean of gradients with respect to x."""
-    whole = () if estimate.preconditioned else bounded_with_preconditioner(run.problem)
-    return run.state.noise.update(estimate.gradient, estimate.variance, whole)
+    """Add a gradient to the statistics, and return its fraction of noise."""
+    fresh = estimate.get(GradientAtBounds)
+    known = estimate.gradient | (fresh.values if fresh else {})
+    bounded = {key: known[key] for key in bounded_with_preconditioner(run.problem)}
+    return run.state.noise.update(estimate.gradient, estimate.variance, bounded)
 
 
 def _not_finite(estimate: Estimate) -> str:
@@ -214,11 +223,12 @@ class _Update:
     shortened: tuple[str, ...] = ()
 
 
-def _apply(run: Run, estimate: Estimate) -> _Update:
+def _apply(run: Run, estimate: Estimate, free: Tree) -> _Update:
     """Transform, update, transform back, and bound: the optimizer uses the problem's `coordinates`; bounds apply to the parameters."""
     problem, parameters, state = run.problem, run.parameters, run.state.optimizer
-    coordinates, mean = problem.coordinates, run.state.noise.mean
-    free = {} if estimate.preconditioned or mean is None else free_of_bounds(problem, parameters, mean, run.step)
+    if estimate.preconditioned:  # in coordinates in which elements that stay are apart
+        problem, free = with_held_elements(problem, free), {}
+    coordinates = problem.coordinates
     mapped = by_coordinates(estimate, problem, parameters, free)
     steps, state = run.optimizer.update(mapped, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps, free)

@@ -314,13 +314,15 @@ class GradientNoise:
     second_moment: float = 0.0
     weight: float = 0.0
 
-    def update(self, gradient: Tree, variance: Tree | None = None, whole: Collection[str] = ()) -> float | None:
+    def update(self, gradient: Tree, variance: Tree | None = None, whole: Tree | None = None) -> float | None:
         """Add a gradient, and return the fraction in [0, 1]; None for fewer than ten gradients without variance, and for a zero gradient.
 
         With the estimator's variance, the result is its fraction of ‖g‖². Gradients of an estimator that reuses earlier samples resemble
-        each other, and would otherwise appear free of noise. The parameters `whole` always have a full mean, for `free_of_bounds`.
+        each other, and would otherwise appear free of noise. `whole` are gradients that have a full mean,
+        for `free_of_bounds`.
         """
-        sampled = self._follow(gradient if variance is None else {key: gradient[key] for key in whole}, whole)
+        whole = whole or {}
+        sampled = self._follow(gradient | whole if variance is None else whole, whole)
         if variance is not None:
             sums = sum(map(arrays.total, variance.values())), sum(map(memory.square, gradient.values()))
             arrays.evaluate(sums)

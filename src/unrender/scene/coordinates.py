@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from unrender.core import arrays, periodic, trees
 from unrender.core.trees import Tree
 from unrender.parameterisations import Transform
-from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.base import HeldElements, Preconditioner
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,18 @@ class Coordinates:
         """Return the tangent of x, φ' (S t), from a tangent t of v."""
         return _times(self._precondition(tangent), slopes)
 
+    @property
+    def held(self) -> dict[str, HeldElements]:
+        """The preconditioners of parameters of which elements may stay at a bound."""
+        return {key: S for key, S in self.preconditioners.items() if isinstance(S, HeldElements)}
+
     def moved(self, parameters: Tree, steps: Tree, free: Tree | None = None) -> tuple[Tree, Tree]:
         """Return u and x after steps of v. Elements of x whose change is zero keep their exact value.
 
         Args:
             free: {key: 0 for elements that stay at a bound, 1 for the others} of parameters with a preconditioner and without a φ.
         """
-        changes = _times(self._precondition(steps), free or {})
+        changes = _times(self._precondition(steps), {key: S.free for key, S in self.held.items()} | (free or {}))
         reached = trees.add(self.of(parameters), changes)
 
         def values(key: str):
