@@ -349,3 +349,15 @@ def test_a_mesh_whose_texture_has_jumps_is_told() -> None:
         lines(**bitmap | {"bitmap": grey, "to_uv": mi.ScalarTransform4f().scale(3.1)}) == []
     )  # it differs by rounding
     assert len(lines(**bitmap, filter_type="nearest")) == len(lines(type="checkerboard")) == 1
+
+
+def test_shadows_of_spheres_on_a_mesh_with_unknown_vertices_are_told() -> None:
+    def lines(centre: list[float], kind: str = "sphere") -> list[str]:
+        place = mi.ScalarTransform4f().translate(centre).scale(0.2)
+        ball = {"type": kind, "to_world": place, "bsdf": {"type": "diffuse"}}
+        return [line for line in MitsubaRenderer(scene(ball=ball), 2, [KEY]).notices if "shadow" in line]
+
+    assert lines([0.2, 0.9, 0.4]) == [
+        "ball: path gradients omit the motion of its shadow on thing, because it is not a mesh: load it as a mesh"
+    ]
+    assert lines([0.2, 0.9, 0.4], "cube") == lines([1.5, 0.9, 0.4]) == []  # a mesh, and beside the light

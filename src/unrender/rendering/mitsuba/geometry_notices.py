@@ -101,6 +101,37 @@ def _seen(sensor: Any, scene: Any, meshes: list[Any]) -> np.ndarray:
     return counts
 
 
+_POINTS, _SHADED = 4096, 0.01
+"""Number of points of a mesh at which shadows are looked for, and smallest share of them in shadow that is told."""
+
+
+def shadow_notices(scene: Any, keys: Collection[str]) -> list[str]:
+    """Return a notice about each shape that is not a mesh and casts a shadow on a mesh with unknown vertices, as loaded.
+
+    Args:
+        scene: `mi.Scene`.
+        keys: the unknown parameters.
+    """
+    round_ones = [shape for shape in scene.shapes() if not (shape.is_mesh() or shape.is_emitter() or shape.is_sensor())]
+    meshes, lines = _unknown_meshes(scene, keys) if scene.emitters() and not has_instances(scene) else [], []
+    for mesh in meshes:
+        samples = np.random.default_rng(0).uniform(0.0, 1.0, (2, 2, _POINTS)).astype(np.float32)
+        at = mesh.sample_position(0.0, mi.Point2f(samples[0]))
+        si = dr.zeros(mi.SurfaceInteraction3f, _POINTS)
+        si.p, si.n = at.p, at.n
+        ds, light = scene.sample_emitter_direction(si, mi.Point2f(samples[1]), False)
+        lit = dr.any(light != 0) & (ds.pdf > 0)
+        ray = si.spawn_ray(ds.d)
+        ray.maxt = 0.999 * ds.dist
+        for shape in round_ones:
+            if np.mean(np.array(scene_of([shape]).ray_test(ray, active=lit))) >= _SHADED:
+                lines.append(
+                    f"{shape.id()}: path gradients omit the motion of its shadow on {mesh.id()}, because it is not a mesh: load it "
+                    "as a mesh"
+                )
+    return lines
+
+
 _PAIRS, _APART, _HALVINGS, _JUMP = 4096, 0.02, 16, 0.5
 """Pairs of texture coordinates, their first distance, number of times that the half with the larger difference is taken, and the share of
 the first difference that remains where a texture jumps."""

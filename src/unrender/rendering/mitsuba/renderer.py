@@ -18,7 +18,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, poses, turned_lights
 from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.film_response import is_spectral
-from unrender.rendering.mitsuba.geometry_notices import contact_notices, jump_notices, specular_notices
+from unrender.rendering.mitsuba.geometry_notices import contact_notices, jump_notices, shadow_notices, specular_notices
 from unrender.rendering.mitsuba.geometry_terms import (
     lens_parameters,
     moved_sensor,
@@ -99,6 +99,7 @@ class MitsubaRenderer:
             *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
             *contact_notices(self.pair.current, keys),
             *specular_notices(self.pair.current, keys),
+            *shadow_notices(self.pair.current, keys),
             *jump_notices(self.pair.current, self.pair.loaded().graph, keys),
             *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
