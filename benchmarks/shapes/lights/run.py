@@ -1,5 +1,5 @@
-"""Poses of lights from few pictures: a spotlight's aim, those of 16 at once, a projector's pose, an area light's place, the turn of an
-environment map and of a sky.
+"""Poses of lights from few pictures: a spotlight's aim, those of 16 at once, a projector's pose, places of area lights, the turn of an
+environment map and of a sky. A lamp that is a mesh has path gradients with boundary terms, which get the processor time of `auto`.
 
 A floor and a box, small pictures, starts that differ by seed. `auto` takes a fixed number of steps. Mitsuba's own loop (`mi.render`,
 `mi.ad.Adam`) turns spotlights and the environment map by `prb`, and moves the area light by `prb_projective`. There the derivatives by the
@@ -17,7 +17,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import mi, parts
+from benchmarks.internals import dr, mi, parts
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import StockViews
@@ -31,11 +31,13 @@ UNKNOWN: dict[str, dict[str, float]] = {
     "places": {f"lamp_{n}.translation.{axis}": 0.15 for n in range(16) for axis in "xz"},
     "projector": {"lamp.translation": 0.2, "lamp.rotation": 0.1},
     "area": {"lamp.translation": 0.4},
+    "mesh": {"lamp.translation": 0.4},
     "envmap": {"lamp.rotation.y": 0.5},
     "sunsky": {"lamp.rotation.y": 0.5},
 }
 """{light: {key: distance of the start from the truth, in each number}}."""
 LARGE: dict[str, dict[str, int]] = {
+    "mesh": {"resolution": 48},
     "spots": {"steps": 400, "resolution": 32},
     "places": {"steps": 40, "resolution": 32},
 }
@@ -44,13 +46,13 @@ RATES, SPP, TIMES = (0.01, 0.03), 16, 3
 _PROJECTIVE = {"type": "prb_projective", "guiding": "none", "sppc": SPP, "sppp": SPP // 2, "sppi": SPP // 2}
 WRONG = "projector", "sunsky"
 """Lights by whose transforms Mitsuba's derivatives are wrong."""
-LOOPS: dict[str, dict[str, Any]] = {"area": _PROJECTIVE} | {n: {"type": "prb"} for n in ("spot", "spots", "envmap")}
+LOOPS: Any = {"area": _PROJECTIVE, "mesh": _PROJECTIVE} | {key: {"type": "prb"} for key in ("spot", "spots", "envmap")}
 """{light: integrator of Mitsuba's loop}."""
 
 
 def lights(name: str) -> dict[str, Any]:
     """The lights of a case by id."""
-    if name not in LARGE:
+    if name not in ("spots", "places"):
         return {"lamp": light(name)}
     colours, found = np.random.default_rng(0).uniform(1.2, 4.0, (16, 3)), {}
     for n, (x, z) in enumerate((x, z) for x in (-1.5, -0.5, 0.5, 1.5) for z in (-1.5, -0.5, 0.5, 1.5)):
@@ -70,9 +72,10 @@ def light(name: str) -> dict[str, Any]:
         case "projector":
             irradiance = {"type": "bitmap", "bitmap": picture, "raw": True}
             return {"type": "projector", "to_world": down, "irradiance": irradiance, "fov": 35.0, "scale": 9.0}
-        case "area":
-            place = mi.ScalarTransform4f().translate([0.4, 2.2, 0.3]).rotate([1, 0, 0], 90).scale(0.3)
-            return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": parts.colour(12.0)}}
+        case "area" | "mesh":
+            place = mi.ScalarTransform4f().translate([0.4, 2.2, 0.3]).rotate([1, 0, 0], 90).scale([0.3, 0.3, 0.02])
+            kind, emitter = "rectangle" if name == "area" else "cube", {"type": "area", "radiance": parts.colour(12.0)}
+            return {"type": kind, "to_world": place, "emitter": emitter}
         case "sunsky":
             return {"type": "sunsky", "sun_direction": [0.5, 0.7, 0.4]}
     return {"type": "envmap", "bitmap": picture}
@@ -117,8 +120,10 @@ def by_part(ends: Mapping[str, Any]) -> dict[str, float]:
 
 
 def moved(lamp: str, adam: Any, first: Any) -> Any:
-    """The transform of a light in the loop: moved, or turned about its own place."""
+    """The transform or vertices of a light in the loop: moved, or turned about its own place."""
     values = {key.partition(".")[2]: value for key, value in adam.items() if key.startswith(f"{lamp}.")}
+    if isinstance(first, mi.Float):
+        return dr.ravel(dr.unravel(mi.Point3f, first) + values["translation"])
     if "translation" in values:
         return mi.Transform4f().translate(values["translation"]) @ first
     place, turn = first @ mi.Point3f(0), mi.Transform4f()
@@ -127,15 +132,14 @@ def moved(lamp: str, adam: Any, first: Any) -> Any:
     return mi.Transform4f().translate(place) @ turn @ mi.Transform4f().translate(-place) @ first
 
 
-def solved(made: ur.Problem, steps: int, seed: int) -> tuple[dict[str, float], float]:
-    """The largest errors of `auto`, and its processor seconds."""
-    clock = Kept(math.inf)
-    result = ur.optimize(made, steps=steps, seed=seed, callbacks=[clock], progress=False)
+def solved(made: ur.Problem, steps: int, seed: int, method: str = "auto", limit: float = math.inf) -> tuple[Any, float]:
+    """The largest errors of a method, and its processor seconds."""
+    clock = Kept(limit)
+    result = ur.optimize(made, method, steps=steps, seed=seed, callbacks=[clock], progress=False)
     return by_part(result.parameters), clock.seconds
 
 
 def together(ends: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """The errors of all runs by part."""
     return {part: [end[part] for end in ends] for part in ends[0]}
 
 
@@ -144,7 +148,8 @@ def loop(made: ur.Problem, name: str, rate: float, seed: int, seconds: float, re
     loaded = mi.load_dict(scene(name, len(made.views), resolution))
     parameters = mi.traverse(loaded)
     stock = StockViews(made, LOOPS[name], (loaded, parameters))
-    first = {lamp: mi.Transform4f(parameters[f"{lamp}.to_world"]) for lamp in lights(name)}
+    at = {lamp: f"{lamp}.vertex_positions" if name == "mesh" else f"{lamp}.to_world" for lamp in lights(name)}
+    first = {lamp: type(parameters[key])(parameters[key]) for lamp, key in at.items()}
     adam = mi.ad.Adam(lr=rate)
     for key in UNKNOWN[name]:
         start = np.ravel(made.unknowns[key].initial).tolist()
@@ -156,9 +161,9 @@ def loop(made: ur.Problem, name: str, rate: float, seed: int, seconds: float, re
         if step and work_time() - began > seconds:
             break
         for lamp, loaded_at in first.items():
-            parameters[f"{lamp}.to_world"] = moved(lamp, adam, loaded_at)
+            parameters[at[lamp]] = moved(lamp, adam, loaded_at)
         parameters.update()
-        stock.backward(seed, step, range(len(made.views)), 0 if name == "area" else SPP)
+        stock.backward(seed, step, range(len(made.views)), 0 if LOOPS[name] is _PROJECTIVE else SPP)
         adam.step()
     return by_part(dict(adam.items()))
 
@@ -183,10 +188,11 @@ def run(
         for count in views:
             made = [problem(name, count, seed, size["resolution"], reference_spp) for seed in range(seeds)]
             runs = [solved(one, size["steps"], seed) for seed, one in enumerate(made)]
-            entry: dict[str, Any] = {
-                "errors": together([ends for ends, _ in runs]),
-                "seconds": float(np.median([seconds for _, seconds in runs])),
-            }
+            ends, seconds = zip(*runs, strict=True)
+            entry: dict[str, Any] = {"errors": together(ends), "seconds": float(np.median(seconds))}
+            if name == "mesh":
+                paths = [solved(one, 1 << 20, n, "plain", seconds[n])[0] for n, one in enumerate(made)]
+                entry["paths"] = together(paths)
             if name in LOOPS:
                 given = TIMES * entry["seconds"], size["resolution"]
                 tried = [[loop(one, name, rate, n, *given) for n, one in enumerate(made)] for rate in RATES]
@@ -197,8 +203,8 @@ def run(
     return {"cases": found}
 
 
-def _middle(errors: list[float]) -> tuple[float, float]:
-    return float(np.median(errors)), max(errors)
+def _ends(entry: Mapping[str, Any], side: str, other: str, key: str) -> str:
+    return "{:.2g} ({:.2g})".format(*(f(entry[side][key]) for f in (np.median, max))) if side in entry else other
 
 
 def table(record: Record) -> str:
@@ -207,11 +213,10 @@ def table(record: Record) -> str:
     for name, counts in record["cases"].items():
         for count, entry in counts.items():
             none = "wrong derivative" if name in WRONG else "not measured"
-            for key, errors in entry["errors"].items():
-                loop = "{:.2g} ({:.2g})".format(*_middle(entry["loop"][key])) if "loop" in entry else none
-                cells = *(f"{x:.2g}" for x in _middle(errors)), f"{entry['seconds']:.2f}", loop
-                rows.append([name, count, key, *cells])
-    head = "light | pictures | unknown | median error | largest | seconds of `auto` | Mitsuba's loop in three times these: median (largest)"
-    settings = "{seeds} starts, {steps} steps, pictures of {resolution}² (`spots`: 400 steps, `places`: 40, 32²). "
-    settings += "Errors are largest absolute ones, in scene units or radians."
-    return markdown.blocks(settings.format(**record["settings"]), markdown.table(head, rows))
+            for key in entry["errors"]:
+                ends = (_ends(entry, *of, key) for of in (("errors", ""), ("paths", ""), ("loop", none)))
+                rows.append([name, count, key, f"{entry['seconds']:.2f}", *ends])
+    head = "light | pictures | unknown | seconds | `auto` | boundary terms | Mitsuba's loop in three times these"
+    text = "Largest errors, in scene units or radians: median (largest) of 5 starts, 20 steps, 16² pixels (`spots`: 2 starts, 400 steps, "
+    text += "32²; `places`: 2 starts, 40 steps, 32²; `mesh`: 3 starts, 48²)."
+    return markdown.blocks(text, markdown.table(head, rows))
