@@ -232,3 +232,24 @@ def test_in_scattering_in_a_channel_without_extinction_is_differentiated_beyond_
     # The lamp of radius r is a point of intensity π r² at 2 from the axis: ∫₀^∞ π r² / (4π (4 + (t - 3)²)) dt per pixel.
     expected = 0.3**2 / 4 * (np.pi / 2 + np.arctan(1.5)) / 2 * SIZE * SIZE
     assert found == pytest.approx(expected, rel=0.05)
+
+
+def test_a_sky_around_fog_without_a_border_is_told():
+    """Mitsuba's picture depends on whether emitters are sampled there; inside a shape it does not."""
+    fog = {"type": "homogeneous", "sigma_t": 0.1, "albedo": 0.9}
+    inside = {"pinhole": camera(INSIDE)}
+    closed = scene(fog, inside, told=("pinhole",))
+    endless = {name: part for name, part in closed.items() if name != "body"}
+    dark = {name: part for name, part in endless.items() if name != "sky"}
+    for description, told in ((endless, True), (closed, False), (dark, False)):
+        notices = MitsubaRenderer(description).notices
+        assert any("put the medium inside a closed shape" in line for line in notices) is told
+    means: dict[str, list[float]] = {"closed": [], "endless": []}
+    for name, description in (("closed", closed), ("endless", endless)):
+        for sampled in (True, False):
+            air = {**description["air"], "sample_emitters": sampled}
+            loaded = mi.load_dict({**description, "air": air})
+            integrator = mi.load_dict({"type": "volpath", "max_depth": 4})
+            means[name].append(float(np.mean(mi.render(loaded, integrator=integrator, spp=1024))))
+    assert means["closed"][0] == pytest.approx(means["closed"][1], rel=0.02)
+    assert means["endless"][0] > 1.1 * means["endless"][1]

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender.rendering.mitsuba.scene_graph import all_shapes
+from unrender.rendering.mitsuba.scene_graph import all_shapes, class_name
 from unrender.rendering.mitsuba.scene_loading import media
 
 _log = logging.getLogger("unrender")
@@ -38,16 +38,36 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
         quiet: suppress the warnings.
     """
     result = []
-    for sensor in scene.sensors():
+    for index, sensor in enumerate(scene.sensors()):
         medium = sensor.get_medium()
         if medium is None and _may_be_inside(scene, sensor):
             medium = _surrounding(scene, sensor)
             if medium is not None and not quiet:
                 _log.warning(
-                    "sensor %s: it names no medium, but is inside one; it is rendered inside this medium", sensor.id()
+                    "sensor %s: it names no medium, but is inside one, and is rendered inside it; mi.render would render it outside, so "
+                    "give the sensor this medium before you render references",
+                    sensor.id() or index,
                 )
         result.append(medium)
     return result
+
+
+def unbounded_notices(scene: Any) -> list[str]:
+    """Return one notice if a homogeneous medium without a border meets an environment.
+
+    No free flight ends at infinity, but a connection to an environment has a finite length (two radii of the scene), and the MIS weight of
+    the other strategy is lost.
+    """
+    shapes = all_shapes(scene)
+    outside = [*(sensor.get_medium() for sensor in scene.sensors()), *(shape.exterior_medium() for shape in shapes)]
+    inside = [shape.interior_medium() for shape in shapes]
+    endless = any(class_name(m) == "HomogeneousMedium" and m not in inside for m in outside if m is not None)
+    if scene.environment() is None or not endless:
+        return []
+    return [
+        "a medium without a border surrounds the scene, so paths reach the environment by emitter sampling alone: its brightness depends "
+        "on sample_emitters and on the phase function, as in Mitsuba; put the medium inside a closed shape with a null BSDF"
+    ]
 
 
 def _may_be_inside(scene: Any, sensor: Any) -> bool:
