@@ -44,6 +44,18 @@ def test_derivative_images_of_wide_differences_do_not_hold_a_pose() -> None:
     assert abs(float(result.parameters["block.rotation.y"])) < 4 * 0.015  # standard errors
 
 
+@pytest.mark.slow
+def test_last_differences_are_of_the_part_of_the_picture_that_a_shape_changes() -> None:
+    """Differences of pixels at the end, as wide as a shift of the whole picture, left 0.0027."""
+    made, errors = few_numbers.problem("pose", 16), []
+    for seed in range(6, 12):
+        reference = ur.render(made, made.truth, 0, spp=1024, seed=4000 + seed)
+        own = made.replaced(views=[replace(made.original_views[0], reference=reference)])
+        result = ur.optimize(own, steps=STEPS, seed=seed, progress=False)
+        errors.append(float(result.parameters["block.translation"][1]))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.0017
+
+
 LIGHTS = {
     "ball": {
         "type": "sphere",

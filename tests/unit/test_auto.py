@@ -15,6 +15,8 @@ import tomli_w
 from tests.analytic import AnalyticRenderer
 from unrender import images, losses, optimizers, pixels
 from unrender.core.errors import InputError
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Hessian, HessianNoise
 from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
@@ -23,7 +25,7 @@ from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import first_rates, sampling
+from unrender.methods.rules import first_rates, newton, sampling
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.traits import Traits
 from unrender.preconditioners import LargeSteps, Sobolev
@@ -494,3 +496,25 @@ def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(m
     assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0, largest=largest)
     for settings in ({"image": "plain"}, {"pixels": 8}):
         assert isinstance(chosen(problem(), **settings)[1], optimizers.Adam)
+
+
+def test_curvature_that_is_noise_does_not_hide_what_other_directions_explain() -> None:
+    """At the best place of `box2` at 32² one direction had the curvature -1.6e-13: "-396205 of the loss explained"."""
+    matrices = (
+        Hessian(np.array([[0.5, -4e-10], [-4e-10, -8e-14]])),
+        HessianNoise(np.diag([0.05, 2.0])),
+    )
+    gradient = {"x": np.array([0.02, 0.01])}
+
+    class Noisy:
+        def init(self, *_: Any) -> None: ...
+
+        def estimate(self, *_: Any) -> tuple[Estimate, None]:
+            return Estimate(0.0005, gradient, matrices, {"images": {0: np.zeros((1, 1, 3))}}), None
+
+    class OfLoss:
+        def loss_value(self, *_: Any) -> Any:
+            return np.float64(0.0005)
+
+    explained: Any = newton._explained
+    assert explained(gradient, OfLoss(), Noisy()) == pytest.approx(0.8)

@@ -11,7 +11,7 @@ from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.core.trees import Tree
-from unrender.estimators.capabilities import Hessian
+from unrender.estimators.capabilities import Hessian, HessianNoise
 from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
@@ -32,7 +32,7 @@ from unrender.schedules import Exponential
 from unrender.statistics.scores import positive_inverse
 
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
-"""Stream of the random numbers of `_explained`, and relative eigenvalue below which its matrix counts as singular."""
+"""Stream of the random numbers of `_explained`, and relative eigenvalue below which its matrix counts as singular or as noise."""
 
 
 def cameras(traits: Traits) -> Plan | None:
@@ -102,6 +102,7 @@ def few_numbers(traits: Traits) -> Plan | None:
         # Noise hides what many lights explain; the loss smoothed over all of them rose.
         explained = traits.elements > constants.few_numbers or _explained(problem.initial(), problem, trial) > least
         plateau = not (explained or stands_out(problem, traits.poses))
+    estimator = replace(estimator, shift=constants.pose_last_shift) if shapes else estimator
     why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
@@ -165,9 +166,13 @@ def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
         arrays.number(problem.loss_value(view, 0.5 * (image + images[1][view]))) for view, image in images[0].items()
     )
     loss = 2.0 * mean - 0.5 * sum(losses)
-    hessian = np.mean([arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in estimates], axis=0)
+    hessian, added = (
+        np.mean([arrays.numpy(estimate.require("explained", kind).matrix) for estimate in estimates], axis=0)
+        for kind in (Hessian, HessianNoise)
+    )
     one, other = (trees.ravel(estimate.gradient) for estimate in estimates)
-    seen = np.diag(hessian) != 0.0  # a light that no view sees must not hide what the others explain
+    # A light that no view sees, or curvature that is noise, must not hide what the others explain.
+    seen = np.diag(hessian) > _LEAST_EIGENVALUE * np.diag(added)
     if loss <= 0.0 or not np.isfinite(hessian).all() or not seen.any():
         return 0.0
     inverse = positive_inverse(hessian[np.ix_(seen, seen)], _LEAST_EIGENVALUE)
