@@ -146,3 +146,18 @@ def test_a_choice_that_the_method_makes_anyway_is_no_option_without_effect() -> 
 def test_a_refusal_of_a_method_that_needs_no_problem_comes_before_it_is_loaded() -> None:
     with pytest.raises(InputError, match="option levels has no effect with scheme=loss; it needs scheme=adaptive"):
         method("adaptive").start({"scheme": "loss", "levels": 2})
+
+
+@pytest.mark.parametrize(
+    ("made", "line"),
+    [
+        (lambda: ur.PathGradient(ur.images.RecursiveControlVariate(whole_views=7)), "whole_views has no effect here; it needs pixel mini"),
+        (lambda: ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate(learn_from_draws=False)), "learn_from_draws has"),
+        (lambda: ur.SmoothedDerivatives(0.1, joint=False), 'joint has no effect here; it needs order="hessian" or "hvp"'),
+        (lambda: ur.SmoothedDerivatives(0.1, epsilon=0.1), "epsilon has no effect here"),
+    ],
+)  # fmt: skip
+def test_fields_of_components_that_nothing_reads_are_refused(made: Any, line: str) -> None:
+    with pytest.raises(InputError) as caught:
+        made()
+    assert line in str(caught.value)

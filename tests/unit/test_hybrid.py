@@ -82,7 +82,8 @@ def all_four(whole_views: int = 3) -> ur.estimators.HybridGradient:
 def test_the_path_s_part_is_that_of_its_estimator_to_the_bit(pixels: Any) -> None:
     """For a remembering estimator, over steps at which both groups move."""
     both, alone = problem(), problem(keys=("map",))
-    path = ur.PathGradient(CV("primary", whole_views=2), pixels, spp=4)
+    image = CV("primary") if pixels == ur.pixels.All() else CV("primary", whole_views=2)
+    path = ur.PathGradient(image, pixels, spp=4)
     hybrid = ur.estimators.HybridGradient(path, smoothed())
     state, own = hybrid.init(both, both.initial()), path.init(alone, alone.initial())
     for step in range(5):

@@ -55,3 +55,10 @@ def encode_text(text: str, where: str) -> bytes:
     except UnicodeEncodeError as error:
         part = printable(text[max(error.start - 20, 0) : error.start + 20])
         raise InputError(f"{where}: a name that is not UTF-8 ({part}); rename the file or folder") from error
+
+
+def without_effect(component: Any, names: tuple[str, ...], needs: str) -> None:
+    """Raise `InputError` for one of these fields of a dataclass that nothing reads and that differs from its default."""
+    for field in dataclasses.fields(component):
+        if field.name in names and getattr(component, field.name) != field.default:
+            raise InputError(f"{type(component).__name__}: {field.name} has no effect here; it needs {needs}")

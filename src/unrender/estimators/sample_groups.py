@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -271,6 +271,8 @@ def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, ad
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
         raise InputError(f"{owner}: {type(image).__name__} needs full views; use pixels=unrender.pixels.All()")
+    if isinstance(image, RecursiveControlVariate) and not draws_pixels(pixels):
+        checks.without_effect(image, ("whole_views", "learn_from_draws"), "pixel mini-batches, such as Uniform(4096)")
     if not isinstance(pixels, AdaptiveCounts):
         return
     if adjoint_spp is not None:

@@ -161,6 +161,8 @@ class SmoothedDerivatives:
             )
         if self.hessian_form == "diagonal" and self.hessian_rate is None:
             raise InputError('SmoothedDerivatives: hessian_form="diagonal" requires hessian_rate')
+        if self.order == "gradient":
+            checks.without_effect(self, ("joint", "epsilon"), 'order="hessian" or "hvp"')
         joint = self.joint and self.order != "gradient"
         if self.orthogonal and (self.low_discrepancy or not (joint or self.aggregate) or self.product):
             raise InputError(
