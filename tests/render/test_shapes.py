@@ -306,16 +306,19 @@ def test_a_mesh_that_touches_or_crosses_another_shape_is_told_once() -> None:
 
 
 def test_a_mesh_that_views_show_in_mirrors_or_through_smooth_glass_is_told() -> None:
-    def lines(bsdf: dict[str, Any], place: Any) -> list[str]:
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    meter = {"type": "sphere", "center": [5, 0, 0], "sensor": {"type": "irradiancemeter", "film": film}}
+
+    def lines(bsdf: dict[str, Any], place: Any, **more: Any) -> list[str]:
         pane = {"type": "rectangle", "to_world": place, "bsdf": bsdf}
-        return [line for line in MitsubaRenderer(scene(pane=pane), 6, [KEY]).notices if "mirrors" in line]
+        return [line for line in MitsubaRenderer(scene(pane=pane, **more), 6, [KEY]).notices if "mirrors" in line]
 
     before = mi.ScalarTransform4f().translate([0, 0.2, 1])
     below = mi.ScalarTransform4f().translate([0, -0.5, 0]).rotate([1, 0, 0], -90)
     assert lines({"type": "dielectric"}, before)[0].startswith(
         "views show 100% of thing in mirrors or through smooth glass, where"
     )
-    assert len(lines({"type": "conductor"}, below)) == 1
+    assert len(lines({"type": "conductor"}, below, meter=meter)) == 1
     assert lines({"type": "roughconductor"}, below) == lines({"type": "diffuse"}, below) == []
     assert lines({"type": "conductor"}, below.translate([9, 0, 0])) == []  # out of sight
 

@@ -85,7 +85,8 @@ def _seen(sensor: Any, scene: Any, meshes: list[Any]) -> np.ndarray:
     sampler.seed(0, _SIDE**2)
     number = dr.arange(mi.UInt32, _SIDE**2)
     position = (mi.Point2f(number % _SIDE, number // _SIDE) + 0.5) / _SIDE
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    # An irradiancemeter has no `sample_ray`.
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     ray, active, counts = mi.Ray3f(ray), mi.Bool(True), np.zeros((len(meshes), 2))
     for hit in range(_HITS):
         si = scene.ray_intersect(ray, active)
