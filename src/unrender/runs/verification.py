@@ -41,7 +41,7 @@ _FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.05
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image; that of
 one in few pixels."""
 
-_SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 48.0, 0.03, 0.05, 3.5
+_SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 """Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
 
@@ -240,8 +240,8 @@ def as_few_samples(
     if not (large and shared > _SHARED * deviation and count < _SAMPLES):
         return None
     explanation = (
-        f", as the noise of references with {count:.2g} samples per pixel would: if they have more, the run needs more steps, or light, "
-        "depth, alignment or something else that is not among the unknowns is wrong"
+        f", as the noise of references with {count:.2g} samples per pixel would: if they have several times as many, the run "
+        "needs more steps, or light, depth, alignment or something else that is not among the unknowns is wrong"
     )
     return Misfit(error, size, 0.0, True, explanation, (STEPS, NOISE))
 
