@@ -30,8 +30,7 @@ from unrender.gallery.rooms import IndirectRoom
 from unrender.gallery.specification import build_problem
 from unrender.gallery.volumes import Smoke
 from unrender.images import denoising
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
-from unrender.images.plain import PlainState
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, PlainState
 from unrender.methods import auto, method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import newton

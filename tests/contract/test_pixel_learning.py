@@ -13,7 +13,7 @@ from analytic import problem
 from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
-from unrender.images.plain import PlainState
+from unrender.images.base import PlainState
 from unrender.pixels import pixel_statistics
 from unrender.pixels.pixel_statistics import pool
 from unrender.pixels.tiles import cut

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender.rendering.mitsuba import gpu
+from unrender.backend import variant
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.poses import Assembly
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -22,7 +22,7 @@ VERTICES = "block.vertex_positions"
 @pytest.fixture
 def on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rules of a GPU, on whatever there is."""
-    monkeypatch.setattr(gpu, "is_gpu", lambda: True)
+    monkeypatch.setattr(variant, "is_gpu", lambda: True)
 
 
 def scene(turn: float = 0.0) -> dict[str, Any]:
@@ -101,6 +101,6 @@ def test_images_of_a_pair_of_meshes_trace_one_scene_each(on_gpu: None, monkeypat
 
 
 def test_lookups_outside_of_virtual_calls_have_no_mask(on_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert gpu.lookup_mask(mi.Bool(False)) is True
-    monkeypatch.setattr(gpu, "is_gpu", lambda: False)
-    assert not gpu.lookup_mask(mi.Bool(False))
+    assert variant.lookup_mask(mi.Bool(False)) is True
+    monkeypatch.setattr(variant, "is_gpu", lambda: False)
+    assert not variant.lookup_mask(mi.Bool(False))

@@ -16,8 +16,7 @@ from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.estimators import sample_groups
 from unrender.estimators.sample_groups import GradientRequest
-from unrender.images.base import ImageEstimate, PairRequest
-from unrender.images.plain import PlainState
+from unrender.images.base import ImageEstimate, PairRequest, PlainState
 from unrender.scene.executor import LOCAL
 
 STEPS = (0.1, 0.03, 0.01)

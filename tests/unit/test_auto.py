@@ -25,8 +25,9 @@ from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import first_rates, newton, sampling
+from unrender.methods.rules import newton, sampling
 from unrender.methods.rules.constants import CONSTANTS
+from unrender.methods.rules.paths import first_rates
 from unrender.methods.rules.traits import Traits
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
@@ -114,7 +115,7 @@ def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
         for key, value in found.items()
     }
     known: Any = SimpleNamespace(unknowns=unknowns)
-    assert list(first_rates.first_rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
+    assert list(first_rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
 
 
 def test_positive_numbers_move_as_logarithms() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.core.dropped import DropReport
+from unrender.core.checks import DropReport
 from unrender.estimators.smoothing.function import joint
 
 

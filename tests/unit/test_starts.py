@@ -14,8 +14,8 @@ from unrender import losses
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
-from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.constants import CONSTANTS
+from unrender.methods.rules.paths import start_factors
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter

@@ -1,8 +1,12 @@
-"""Checks of numbers, flags and text from the user. Each failure is one line with the field's name and the expected value."""
+"""Checks of numbers, flags and text from the user, and a count of values that are not finite.
+
+Each failure is one line with the field's name and the expected value.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from numbers import Integral, Real
 from typing import Any
@@ -62,3 +66,27 @@ def without_effect(component: Any, names: tuple[str, ...], needs: str) -> None:
     for field in dataclasses.fields(component):
         if field.name in names and getattr(component, field.name) != field.default:
             raise InputError(f"{type(component).__name__}: {field.name} has no effect here; it needs {needs}")
+
+
+_log = logging.getLogger("unrender")
+
+
+class DropReport:
+    """Counter of dropped values. Logs a warning at the first one and at every tenfold count.
+
+    Attributes:
+        count: number of values dropped so far.
+        total: number of values seen so far.
+    """
+
+    def __init__(self) -> None:
+        self.count, self.total = 0, 0
+        self._reported = 0
+
+    def add(self, dropped: int, of: int, reason: str) -> None:
+        """Record that `dropped` of `of` values were not finite; `reason` names them in the warning."""
+        self.count += dropped
+        self.total += of
+        if self.count >= max(1, 10 * self._reported):
+            self._reported = self.count
+            _log.warning("%s; %d of %d so far were dropped", reason, self.count, self.total)

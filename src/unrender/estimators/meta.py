@@ -16,8 +16,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, GradientAtBounds, Variance
 from unrender.estimators.coordinates import bounded_with_preconditioner
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
-from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimator, PairRequest, Plain, needs_full_views
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
 from unrender.pixels.uniform import All
 from unrender.rendering.renderer import Space

@@ -16,8 +16,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient, NoiseSample
 from unrender.estimators.emitter_selection import EmitterSelection, EmitterState
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, check_pixels, draws_pixels, leave_one_out_groups
-from unrender.images.base import ImageEstimator, needs_full_views
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimator, Plain, needs_full_views
 from unrender.losses.pixelwise import Loss
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.base import MiniBatch, PixelSampler, learned

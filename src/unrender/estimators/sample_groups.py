@@ -19,8 +19,7 @@ from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.gradient_sum import GradientSum, damping, smoothed_variance
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, leave_one_out
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, Plain, leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler

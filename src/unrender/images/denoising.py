@@ -21,8 +21,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, WithoutSnapshot
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, Plain, WithoutSnapshot
 from unrender.rendering.renderer import Space
 from unrender.scene.batches import Frame
 from unrender.scene.problem import Problem
@@ -58,7 +57,7 @@ def choose(by: Denoiser = "auto") -> Denoiser:
 
 def optix_problem() -> str | None:
     """Return why OptiX cannot denoise here, in one line; None if it can. Tested once per process."""
-    on_gpu = variant.is_on_gpu(variant.current())
+    on_gpu = variant.is_gpu()
     return _failure_of_optix() if on_gpu else f"it needs the variant {variant.CUDA}"
 
 

@@ -11,7 +11,7 @@ from unrender import pixels
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.path import PathGradient
-from unrender.images.plain import Plain
+from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Options
 from unrender.methods.plan import Plan

@@ -9,7 +9,7 @@ from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.meta import MetaEstimator
-from unrender.images.plain import Plain
+from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
 from unrender.optimizers.base import Optimizer

@@ -11,9 +11,8 @@ from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient, StockGradient
-from unrender.images.base import ImageEstimator
+from unrender.images.base import ImageEstimator, Plain
 from unrender.images.denoising import Denoised
-from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
 from unrender.optimizers.base import Optimizer

@@ -22,8 +22,7 @@ from unrender.estimators.loss_values import LossValues
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
-from unrender.images.base import ImageEstimator
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimator, Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Options, parameterised, parse_schedule
 from unrender.methods.paths import AdamOptions

@@ -15,8 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree, add, numpy
-from unrender.images.base import ImageEstimator
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimator, Plain
 from unrender.losses import Loss
 from unrender.own_loop import values
 from unrender.own_loop.options import Options, open_scene, problem_of

@@ -21,8 +21,8 @@ from unrender.core.trees import Tree
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.sample_groups import GradientRequest, GradientSample
+from unrender.images.base import Plain
 from unrender.images.denoising import Denoised
-from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.pixel_statistics import PilotRequest

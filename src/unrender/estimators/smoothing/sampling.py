@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import checks
-from unrender.core.dropped import DropReport
+from unrender.core.checks import DropReport
 from unrender.core.errors import InputError
 
 

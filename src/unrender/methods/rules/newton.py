@@ -17,7 +17,7 @@ from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
 from unrender.estimators.variable_projection import IMAGES, can_be_eliminated
-from unrender.images.plain import Plain
+from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling

@@ -1,23 +1,30 @@
-"""Rules for path gradients by kind of unknown, for perturbed renders in combination with them, and for a smoothed loss without them."""
+"""Rules for path gradients by kind of unknown, for perturbed renders in combination with them, and for a smoothed loss without them.
+
+First learning rates follow from the unknowns' ranges and sizes. Factors of unknown lights at the start are least squares, since images
+are linear in them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from unrender import pixels
+from unrender.core import arrays
+from unrender.core.errors import InputError
 from unrender.core.text import grouped, listed
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
-from unrender.images.plain import Plain
+from unrender.images.base import Plain
 from unrender.methods.base import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
-from unrender.methods.rules.brightness import start_factors
-from unrender.methods.rules.first_rates import first_rates, logarithms
+from unrender.methods.rules.constants import CONSTANTS, Constants
 from unrender.methods.rules.newton import with_separate_block
 from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import first_steps, parse_widths
@@ -27,9 +34,13 @@ from unrender.optimizers.recipes import Adam, ScheduleFree
 from unrender.optimizers.transforms.agreement_rate import FEWEST_ELEMENTS
 from unrender.preconditioners import LargeSteps, Sobolev, grid
 from unrender.rendering.partial import PartialDerivatives
+from unrender.scene.bounds import MARGIN, open_scale
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.parameter import ParameterSettings
+from unrender.scene.problem import Problem
+from unrender.scene.render import power_of_two, render, selected_views
 from unrender.schedules import Exponential, InverseRoot
+from unrender.statistics.debiased import normal_equations
 
 _GRID = 4
 """Dimensions of a grid, (Z, Y, X, C)."""
@@ -232,3 +243,152 @@ def _merged(traits: Traits, settings: list[Mapping[str, ParameterSettings]]) -> 
         values = {name: value for own in chosen for name, value in own.items() if value is not None}
         merged[key] = ParameterSettings(**values)
     return merged
+
+
+_ALBEDO, _EXTINCTION, _NORMALS = ".albedo.", ".sigma_t.", ".normalmap."
+"""Parts of keys of a medium's grids, and of a normal map."""
+_TEXELS = ".data"
+"""End of the key of a texture's data."""
+_TEXTURE = 3
+"""Dimensions of a texture, (H, W, C)."""
+
+
+def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
+    """Return the keys of positive numbers, colours and textures without an upper bound: radiances, environment maps.
+
+    Excluded are parameters with their own learning rate, which is in the parameter's units, and grids, parts of which may have to be 0.
+    """
+    return [
+        key
+        for key, unknown in problem.unknowns.items()
+        if (low := unknown.bounds[0]) is not None
+        and unknown.bounds[1] is None
+        and unknown.learning_rate is None
+        and unknown.parameterisation is None
+        and (unknown.initial.ndim == _TEXTURE or _is_number(unknown.initial, constants))
+        and (unknown.initial > low + constants.margins * MARGIN * open_scale(unknown.initial)).all()
+    ]
+
+
+def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS) -> Mapping[str, float]:
+    """Return {key: first learning rate} of each parameter, `share` times its size.
+
+    The size is the range between two bounds, else the root mean square of the initial values, or 1 if they are 0. It is divided by the
+    root of the number of unknown textures of the same material, which share residuals and would together overshoot. For vertices it is
+    `mesh_share` times the mesh's radius. Numbers with two bounds, normal maps, and albedos of media with an unknown extinction have a
+    share of it (`Constants`). With a parameterisation, it is the size in u.
+    """
+    rates: dict[str, float] = {}
+    initial = {key: unknown.initial for key, unknown in problem.unknowns.items()}
+    materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
+    textures = Counter(materials.values())
+    for key, unknown in problem.unknowns.items():
+        value, (low, high) = unknown.initial, unknown.bounds
+        if low is not None and high is not None:
+            size = high - low
+        else:
+            size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
+        if unknown.faces is not None:
+            size = constants.mesh_share * _radius(value)
+        if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.unknowns:
+            size *= constants.albedo_share
+        elif _is_number(value, constants) and low is not None and high is not None:
+            size *= constants.number_share
+        if _NORMALS in key:
+            size *= constants.normals_share
+        if key in materials:
+            size /= math.sqrt(textures[materials[key]])
+        if unknown.transform is not None:
+            middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
+            size /= float(unknown.transform.slope(np.float64(middle)))
+        rates[key] = share * size
+    return rates
+
+
+def _owner(key: str) -> str:
+    """Return the material of a texture from the key of its data."""
+    return key.rsplit(".", 2)[0]
+
+
+def _is_number(value: np.ndarray, constants: Constants) -> bool:
+    """Return whether it is a single number or a colour."""
+    return value.ndim <= 1 and value.size <= constants.number_size
+
+
+def _radius(positions: np.ndarray) -> float:
+    """Return the root mean square distance of vertices (3 V,) from their mean; 1 if it is 0."""
+    vertices = positions.reshape(-1, 3).astype(np.float64)
+    return float(np.sqrt(np.mean(np.sum(np.square(vertices - vertices.mean(axis=0)), axis=1)))) or 1.0
+
+
+_SEEDS = (11, 12)
+"""Seeds of two independent halves."""
+_MOST_PIXELS = 1 << 19
+"""Maximum number of pixels of the views, of which the first is always rendered."""
+_PATHS, _SPP = 1 << 17, (2, 64)
+"""Path budget of the images of one state, and limits of their samples per pixel."""
+_LIMIT = 1e4
+"""Largest factor, and reciprocal of the smallest."""
+_BETTER = 0.25
+"""Ratio of the mean square residuals with and without the factors below which the factors are used."""
+
+
+def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -> dict[str, float]:
+    """Return {key: factor} of the lights' initial values if one is far from 1 and factors reduce the residual well, else {}.
+
+    With D_k, the image of light k alone, f minimises ‖I + Σ (f_k − 1) D_k − R‖². Its normal equations are products of two independent
+    halves, so noise does not bias them. The other unknowns are at their start, so factors are no better than these.
+
+    A start that is ten times too bright costs Adam more steps than one that is ten times too dark: its second moments remember the first
+    gradients, which are a hundred times as large as the later ones.
+
+    The problem's own loss must be less, too. A saturated reference, for example, says nothing against a brighter image.
+
+    Args:
+        keys: Keys of unknown lights.
+        constants: Constants of the rules; `far_light` is the least ratio that counts as far.
+    """
+    if not keys or not problem.loss.pixelwise:
+        return {}
+    try:
+        factors, change, less = _least_squares(problem, keys)
+    except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects
+        return {}
+    far = max((max(f, 1.0 / f) for f in factors.values() if f > 0.0), default=1.0) > constants.far_light
+    usable = all(math.isfinite(f) and 1.0 / _LIMIT < f < _LIMIT for f in factors.values())
+    return factors if usable and far and change < _BETTER and less else {}
+
+
+def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, float], float, bool]:
+    """Return the factors, the ratio of the mean square residuals with and without them, and whether the loss is less with them."""
+    start, selected = problem.initial_values(), selected_views(problem)
+    ends = np.cumsum([math.prod(problem.sizes[view]) for view in selected])
+    most = max(int((ends <= _MOST_PIXELS).sum()), 1)
+    views, pixels = selected[:most], int(ends[most - 1])
+    spp = power_of_two(min(max(_PATHS // pixels, _SPP[0]), _SPP[1]))
+    states: list[Mapping[str, np.ndarray]] = [start, *({**start, key: 2.0 * start[key]} for key in keys)]
+    count = len(keys)
+    matrix, vector, squares, means = np.zeros((count, count)), np.zeros(count), 0.0, {}
+    for view in views:
+        own = problem.views[view]
+        weight = own.weight * own.pixel_weights(problem.sizes[view]).reshape(*problem.sizes[view], 1)
+        halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
+        reference = np.asarray(own.reference)
+        finite = np.asarray(np.isfinite(np.stack(halves)).all(axis=(0, 1, -1)))[..., None]
+        halves = [np.where(finite, images, reference) for images in halves]  # neither residual nor light in the others
+        means[view] = (halves[0] + halves[1]) / 2.0
+        residuals = [reference - images[0] for images in halves]
+        parts = normal_equations([images[1:] - images[0] for images in halves], residuals, weight)
+        matrix, vector = matrix + parts[0], vector + parts[1]
+        squares += float((residuals[0] * residuals[1] * weight).sum())
+    step = np.linalg.solve(matrix, vector)
+    after = squares - 2.0 * float(step @ vector) + float(step @ matrix @ step)
+    factors = {key: 1.0 + float(x) for key, x in zip(keys, step, strict=True)}
+    less = _loss(problem, means, step) < _loss(problem, means, np.zeros(count))
+    return factors, max(after, 0.0) / squares if squares > 0.0 else 1.0, less
+
+
+def _loss(problem: Problem, images: Mapping[int, np.ndarray], step: np.ndarray) -> float:
+    """Return the loss of views from the images of all states and the change of each light's factor."""
+    changed = {view: of[0] + np.tensordot(step, of[1:] - of[0], 1) for view, of in images.items()}
+    return sum(arrays.number(problem.loss_value(view, problem.renderer.array(x))) for view, x in changed.items())

@@ -6,8 +6,7 @@ from typing import Literal
 
 from unrender import pixels
 from unrender.core.errors import InputError
-from unrender.images.base import ImageEstimator
-from unrender.images.plain import Plain
+from unrender.images.base import ImageEstimator, Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.rules.traits import Traits
 from unrender.pixels.base import PixelSampler

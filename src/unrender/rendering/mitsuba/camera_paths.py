@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.core.dropped import DropReport
+from unrender.core.checks import DropReport
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.film_response import FilmResponse, film_samples, with_film

@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.backend import variant
 from unrender.core.welding import weld
-from unrender.rendering.mitsuba import gpu, mesh_layout
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, scene_of
 
@@ -190,7 +191,7 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     if not spheres or any(sensor.get_shape() is not None for sensor in scene.sensors()):
         return scene, []
     groups = [group for group in ObjectGraph(scene).of("shape") if group.class_name().startswith("ShapeGroup")]
-    if groups and gpu.is_gpu():  # OptiX cannot have a group in two scenes, and ends the process
+    if groups and variant.is_gpu():  # OptiX cannot have a group in two scenes, and ends the process
         return scene, []
     replaced = [shape.id() for shape in spheres]
     objects = [_mesh(shape) if shape.id() in replaced else shape for shape in scene.shapes()]

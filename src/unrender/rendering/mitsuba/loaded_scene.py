@@ -19,11 +19,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.backend import variant
 from unrender.core import arrays, memory
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import gpu, spectral_colours
+from unrender.rendering.mitsuba import spectral_colours
 from unrender.rendering.mitsuba.edges import meshed
 from unrender.rendering.mitsuba.frozen import FrozenFunction, build_distributions
 from unrender.rendering.mitsuba.parameters import is_one_direction, normals_key
@@ -329,7 +330,7 @@ class LoadedScene:
         }
         dr.eval(gradients)
         self.clear_gradients()
-        if gpu.is_gpu():  # a texture's copy gives a leaf one gradient only
+        if variant.is_gpu():  # a texture's copy gives a leaf one gradient only
             self._spend()
         return gradients
 

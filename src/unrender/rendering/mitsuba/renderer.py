@@ -12,10 +12,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import gpu, poses, turned_lights
+from unrender.rendering.mitsuba import poses, turned_lights
 from unrender.rendering.mitsuba.camera_media import unbounded_notices
 from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.film_response import is_spectral
@@ -256,7 +257,7 @@ class MitsubaRenderer:
             key: pose
             for key, pose in poses.keys(self.pair.current).items()
             if (pose.light or not self.pair.volumetric)
-            and (key in written or not (pose.light or instances or gpu.is_gpu()))
+            and (key in written or not (pose.light or instances or variant.is_gpu()))
         }
 
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:
@@ -266,7 +267,7 @@ class MitsubaRenderer:
         structure. It also holds in scenes with instances, which Mitsuba cannot add to another scene, and on a GPU, which traces one scene.
         """
         scene = self.pair.loaded()
-        if self._poses[key].light or has_instances(scene.scene) or gpu.is_gpu():
+        if self._poses[key].light or has_instances(scene.scene) or variant.is_gpu():
             return True
         lit = any(other in self._poses and self._poses[other].light and moved_shape(scene, other) for other in keys)
         return lit and key in scene.poses

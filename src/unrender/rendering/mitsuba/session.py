@@ -12,9 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import gpu
 from unrender.rendering.mitsuba.camera_paths import DroppedSamples, Kernel, Paths
 from unrender.rendering.mitsuba.frozen import FrozenFunction, are_recordable, for_every_sensor, shapes_are_recordable
 from unrender.rendering.mitsuba.geometry_terms import (
@@ -99,7 +99,7 @@ class MitsubaSession:
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
         lit = any(shape.is_emitter() and shape.id() in self._moving for shape in pair.current.shapes())
-        self._related = bool(self._moving) and not (lit or gpu.is_gpu() or has_instances(pair.current))
+        self._related = bool(self._moving) and not (lit or variant.is_gpu() or has_instances(pair.current))
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:

@@ -10,12 +10,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.backend.variant import lookup_mask
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import DroppedSamples, Paths, dropped_together, is_finite
 from unrender.rendering.mitsuba.frozen import FrozenFunction
-from unrender.rendering.mitsuba.gpu import lookup_mask
 from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.path_cache.tracing import SOURCES, Lookups, TracePass
