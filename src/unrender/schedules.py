@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from unrender.core import checks
+from unrender.core.checks import Count, NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
@@ -27,17 +28,14 @@ class Schedule(Protocol):
 
 @register(position=1)
 @dataclass(frozen=True)
-class Constant:
+class Constant(checks.Checked):
     """The same factor at every step.
 
     Args:
         factor: the factor, >= 0.
     """
 
-    factor: float = 1.0
-
-    def __post_init__(self):
-        checks.number("Constant", "factor", self.factor, above=0.0, inclusive=True)
+    factor: NotNegative = 1.0
 
     def __call__(self, step: float) -> float:
         return self.factor
@@ -45,7 +43,7 @@ class Constant:
 
 @register(position=2)
 @dataclass(frozen=True)
-class Exponential:
+class Exponential(checks.Checked):
     """2^(−step / half_life), but at least `floor`.
 
     Args:
@@ -53,12 +51,8 @@ class Exponential:
         floor: smallest factor, >= 0.
     """
 
-    half_life: float
-    floor: float = 0.0
-
-    def __post_init__(self):
-        checks.number("Exponential", "half_life", self.half_life, above=0.0)
-        checks.number("Exponential", "floor", self.floor, above=0.0, inclusive=True)
+    half_life: Positive
+    floor: NotNegative = 0.0
 
     def __call__(self, step: float) -> float:
         return max(self.floor, 0.5 ** (step / self.half_life))
@@ -66,17 +60,14 @@ class Exponential:
 
 @register(position=3)
 @dataclass(frozen=True)
-class InverseRoot:
+class InverseRoot(checks.Checked):
     """1 / √(1 + step / time), which decreases early and has no end.
 
     Args:
         time: step at which the factor is 1/√2, > 0.
     """
 
-    time: float
-
-    def __post_init__(self):
-        checks.number("InverseRoot", "time", self.time, above=0.0)
+    time: Positive
 
     def __call__(self, step: float) -> float:
         return 1.0 / math.sqrt(1.0 + step / self.time)
@@ -84,17 +75,14 @@ class InverseRoot:
 
 @register(position=7)
 @dataclass(frozen=True)
-class Inverse:
+class Inverse(checks.Checked):
     """1 / (1 + step / time), the rate at which Newton steps average out noise (Robbins and Monro 1951).
 
     Args:
         time: step at which the factor is 1/2, > 0.
     """
 
-    time: float
-
-    def __post_init__(self):
-        checks.number("Inverse", "time", self.time, above=0.0)
+    time: Positive
 
     def __call__(self, step: float) -> float:
         return 1.0 / (1.0 + step / self.time)
@@ -102,7 +90,7 @@ class Inverse:
 
 @register(position=4)
 @dataclass(frozen=True)
-class Cosine:
+class Cosine(checks.Checked):
     """Half a cosine from 1 at step 0 to `floor` at step `steps`, then constant.
 
     Args:
@@ -110,12 +98,8 @@ class Cosine:
         floor: last factor, >= 0.
     """
 
-    steps: int
-    floor: float = 0.0
-
-    def __post_init__(self):
-        checks.integer("Cosine", "steps", self.steps, at_least=1)
-        checks.number("Cosine", "floor", self.floor, above=0.0, inclusive=True)
+    steps: Count
+    floor: NotNegative = 0.0
 
     def __call__(self, step: float) -> float:
         done = min(step / self.steps, 1.0)
@@ -124,7 +108,7 @@ class Cosine:
 
 @register(position=5)
 @dataclass(frozen=True)
-class Steps:
+class Steps(checks.Checked):
     """`factor` to the power of the integer part of step / `every`.
 
     A factor above 1 overflows to infinity in the end, which optimizers refuse.
@@ -134,12 +118,8 @@ class Steps:
         factor: factor, > 0, usually below 1.
     """
 
-    every: int
-    factor: float = 0.5
-
-    def __post_init__(self):
-        checks.integer("Steps", "every", self.every, at_least=1)
-        checks.number("Steps", "factor", self.factor, above=0.0)
+    every: Count
+    factor: Positive = 0.5
 
     def __call__(self, step: float) -> float:
         try:
@@ -158,11 +138,11 @@ class Warmup:
         then: the following schedule; None stays at 1.
     """
 
-    steps: int
+    steps: Count
     then: Schedule | None = None
 
     def __post_init__(self):
-        checks.integer("Warmup", "steps", self.steps, at_least=1)
+        checks.fields(self)
         if self.then is not None and not callable(self.then):
             raise InputError(f"Warmup: then must be a schedule or None, got {self.then!r}")
 

@@ -6,13 +6,31 @@ Each failure is one line with the field's name and the expected value.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import logging
 import math
+import sys
+from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from unrender.core.errors import InputError
 from unrender.core.text import printable
+
+Positive = Annotated[float, 0.0]
+"""Annotation of a field: a finite number > 0."""
+NotNegative = Annotated[float, 0.0, math.inf, True]
+"""A finite number >= 0."""
+Fraction = Annotated[float, 0.0, 1.0, True]
+"""A number in [0, 1)."""
+OpenFraction = Annotated[float, 0.0, 1.0]
+"""A number in (0, 1)."""
+Index = Annotated[int, 0]
+Count = Annotated[int, 1]
+Several = Annotated[int, 2]
+"""Whole numbers of at least 0, 1 and 2."""
 
 
 def number(
@@ -42,11 +60,58 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
     raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")
 
 
-def flags(part: Any) -> None:
-    """Raise `InputError` unless each field of a dataclass instance whose annotation is `bool` is true or false."""
-    for field in dataclasses.fields(part):
-        if field.type in ("bool", bool) and type(value := getattr(part, field.name)).__name__ not in ("bool", "bool_"):
-            raise InputError(f"{type(part).__name__}: {field.name} must be true or false, got {value!r}")
+def flag(owner: str, name: str, value: Any) -> None:
+    """Raise `InputError` unless `value` is true or false."""
+    if type(value).__name__ not in ("bool", "bool_"):
+        raise InputError(f"{owner}: {name} must be true or false, got {value!r}")
+
+
+def choice(owner: str, name: str, value: Any, *choices: str) -> None:
+    """Raise `InputError` unless `value` is one of `choices`."""
+    if value not in choices:
+        words = " or ".join(", ".join(f'"{each}"' for each in choices).rsplit(", ", 1))
+        raise InputError(f"{owner}: {name} must be {words}, got {value!r:.80}")
+
+
+def fields(part: Any, owner: str = "") -> None:
+    """Raise `InputError` unless each field of a dataclass instance fits its annotation.
+
+    Checked are the ranges above, `bool` and `Literal`, each also with `| None`. `owner` is the name in messages; "" is the class's.
+    """
+    for name, check, limits, optional in _checked(type(part)):
+        if not (optional and getattr(part, name) is None):
+            check(owner or type(part).__name__, name, getattr(part, name), *limits)
+
+
+class Checked:
+    """Base of dataclasses without other checks than those of `fields`."""
+
+    def __post_init__(self) -> None:
+        fields(self)
+
+
+@functools.cache
+def _checked(kind: type) -> list[tuple[str, Callable[..., Any], tuple[Any, ...], bool]]:
+    """Return (field, check, its limits, whether the field may be None) of the fields of a dataclass that have a check."""
+    found = []
+    for field in dataclasses.fields(kind):
+        annotation: Any = field.type
+        if isinstance(annotation, str):
+            home = next(base for base in kind.__mro__ if field.name in inspect.get_annotations(base))
+            try:  # each alone, since some names are imported for type checkers only
+                annotation = eval(annotation, vars(sys.modules[home.__module__]))
+            except (NameError, TypeError):
+                continue
+        kinds = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+        others = [each for each in kinds if each is not NoneType]
+        limits = tuple(limit for each in others for limit in get_args(each))
+        if others == [bool]:
+            found.append((field.name, flag, (), len(kinds) > 1))
+        elif all(get_origin(each) is Literal for each in others):
+            found.append((field.name, choice, limits, len(others) < len(kinds)))
+        elif len(others) == 1 and get_origin(others[0]) is Annotated:
+            found.append((field.name, integer if limits[0] is int else number, limits[1:], len(kinds) > 1))
+    return found
 
 
 def encode_text(text: str, where: str) -> bytes:

@@ -190,7 +190,7 @@ def observed(problem: Problem, state: EmitterState, gradient: Tree) -> EmitterSt
 
 
 def check(owner: str, emitters: Any, groups: int, equal_counts: bool) -> None:
-    """Raise `InputError` for an invalid choice of emitters, or one that the samples do not support.
+    """Raise `InputError` for a choice of emitters that the samples do not support.
 
     Args:
         owner: class name for messages.
@@ -198,8 +198,6 @@ def check(owner: str, emitters: Any, groups: int, equal_counts: bool) -> None:
         groups: number of leave-one-out groups.
         equal_counts: whether all pixels have equal sample counts.
     """
-    if emitters not in ("scene", "adaptive"):
-        raise InputError(f'{owner}: emitters must be "scene" or "adaptive", got {emitters!r}')
     if emitters == "adaptive" and not equal_counts:
         raise InputError(
             f'{owner}: emitters="adaptive" needs equal sample counts in all pixels; use another pixel sampler than AdaptiveCounts'

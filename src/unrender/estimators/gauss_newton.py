@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import Positive, Several
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -135,30 +136,24 @@ class GaussNewton:
         derivative_images: whether those of all views are returned (`DerivativeImages`), which takes 12 bytes per pixel and element.
     """
 
-    spp: int = 256
-    derivative_spp: int = 32
-    shift: float = 0.3
-    width: float = 0.01
-    tolerance: float = 2.0
-    coarse: float | None = None
+    spp: Several = 256
+    derivative_spp: Several = 32
+    shift: Positive = 0.3
+    width: Positive = 0.01
+    tolerance: Positive = 2.0
+    coarse: Positive | None = None
     largest: Mapping[str, float] = field(default_factory=dict)
-    noise_limit: float | None = None
+    noise_limit: Positive | None = None
     by_channel: bool = False
     remember: bool = False
     scores: bool = True
     derivative_images: bool = False
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         for key, width in self.largest.items():
             checks.number("GaussNewton", f"largest of {key}", width, above=0.0)
-        for name in ("spp", "derivative_spp"):
-            checks.integer("GaussNewton", name, getattr(self, name), at_least=2)
-        for name in ("shift", "width", "tolerance"):
-            checks.number("GaussNewton", name, getattr(self, name), above=0.0)
-        if self.noise_limit is not None:
-            checks.number("GaussNewton", "noise_limit", self.noise_limit, above=0.0)
-        if self.coarse is not None and checks.number("GaussNewton", "coarse", self.coarse, above=0.0) < self.shift:
+        if self.coarse is not None and self.coarse < self.shift:
             raise InputError(f"GaussNewton: coarse must be at least shift, {self.shift:g}, got {self.coarse:g}")
 
     @property

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import Count, Index
 from unrender.core.errors import InputError
 from unrender.core.random import WARM_UP, Key
 from unrender.core.registry import register
@@ -142,12 +143,12 @@ class HybridGradient:
     )
     keys: tuple[str, ...] | None = None
     averaged: bool = False
-    wait: int = 0
-    every: int = 1
+    wait: Index = 0
+    every: Count = 1
     eliminated: tuple[str, ...] = ()
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
             raise InputError(
                 f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}"
@@ -157,8 +158,6 @@ class HybridGradient:
                 f"HybridGradient: path must be an estimator of path gradients, such as PathGradient(), got "
                 f"{type(self.path).__name__}"
             )
-        checks.integer("HybridGradient", "wait", self.wait, at_least=0)
-        checks.integer("HybridGradient", "every", self.every, at_least=1)
         if self._is_block and self.averaged:
             raise InputError("HybridGradient: averaged requires SmoothedDerivatives, got GaussNewton")
         if not self._is_block and (self.wait or self.every > 1 or self.eliminated):

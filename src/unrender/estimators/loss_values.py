@@ -9,6 +9,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
+from unrender.core.checks import Count
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -25,7 +26,7 @@ class LossState:
 
 @register
 @dataclass(frozen=True)
-class LossValues:
+class LossValues(checks.Checked):
     """The loss at any points, without derivatives: for searches such as `optimizers.CMAES`.
 
     Every point of a step is rendered with the same random numbers. Unbiased for the expected loss of images with this noise.
@@ -34,10 +35,7 @@ class LossValues:
         spp: samples per pixel of a render, >= 1.
     """
 
-    spp: int = 4
-
-    def __post_init__(self):
-        checks.integer("LossValues", "spp", self.spp, at_least=1)
+    spp: Count = 4
 
     provides = Capabilities(LossFunction)
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from unrender.core import arrays, checks, memory, trees
 from unrender.core.arrays import Array
+from unrender.core.checks import Count, Fraction
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -143,14 +144,14 @@ class MetaEstimator:
             groups, such as 1; otherwise it saves nothing.
     """
 
-    proportional_spp: int | None = None
-    difference_spp: int | None = None
+    proportional_spp: Count | None = None
+    difference_spp: Count | None = None
     coupled: bool = False
-    spp: int | None = None
+    spp: Count | None = None
     image: ImageEstimator = field(default_factory=Plain)
     space: Space | Literal["auto"] = "auto"
-    beta_proportional: float = meta.BETA_PROPORTIONAL
-    beta_difference: float = meta.BETA_DIFFERENCE
+    beta_proportional: Fraction = meta.BETA_PROPORTIONAL
+    beta_difference: Fraction = meta.BETA_DIFFERENCE
     clip: bool = True
     max_weight: float = 1.0
     centred: bool = False
@@ -160,7 +161,7 @@ class MetaEstimator:
     difference_images: Literal["own", "proportional"] = "own"
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         for name, coupled, default in (
             ("proportional_spp", False, _PROPORTIONAL_SPP),
             ("difference_spp", False, _DIFFERENCE_SPP),
@@ -168,25 +169,13 @@ class MetaEstimator:
         ):
             value = getattr(self, name)
             if value is not None:
-                checks.integer("MetaEstimator", name, value, at_least=1)
                 if coupled != self.coupled:
                     form = "coupled" if coupled else "independent"
                     raise InputError(f"MetaEstimator: {name} is for the {form} form; give coupled={coupled} with it")
             elif coupled == self.coupled:
                 object.__setattr__(self, name, default)
-        for name in ("beta_proportional", "beta_difference"):
-            checks.number("MetaEstimator", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         if not checks.number("MetaEstimator", "max_weight", self.max_weight, above=0.0) <= 1:
             raise InputError(f"MetaEstimator: max_weight must be in (0, 1], got {self.max_weight!r}")
-        for name, choices in (
-            ("space", ("auto", "path", "primary")),
-            ("statistics", ("shared", "independent")),
-            ("difference_images", ("own", "proportional")),
-        ):
-            if getattr(self, name) not in choices:
-                raise InputError(
-                    f"MetaEstimator: {name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
-                )
         if not self.coupled and not isinstance(self.image, Plain):
             raise InputError("MetaEstimator: image is for the coupled form; give coupled=True with it")
         if self.difference_images == "proportional" and (self.coupled or not isinstance(self.pixels, All)):

@@ -7,6 +7,7 @@ from functools import reduce
 from typing import Any
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import Count, Index, NotNegative
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -103,21 +104,16 @@ class PathGradient:
 
     image: ImageEstimator = field(default_factory=Plain)
     pixels: PixelSampler = field(default_factory=All)
-    spp: int = 4
-    adjoint_spp: int | None = None
-    tolerance: float = 0.0
-    fresh_from: int = 0
+    spp: Count = 4
+    adjoint_spp: Count | None = None
+    tolerance: NotNegative = 0.0
+    fresh_from: Index = 0
     noise_sample: bool = False
     emitters: EmitterSelection = "scene"
     differential_bsdf: bool = False
 
     def __post_init__(self):
-        checks.flags(self)
-        checks.number("PathGradient", "tolerance", self.tolerance, above=0.0, inclusive=True)
-        for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
-            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-                raise InputError(f"PathGradient: {name} must be a whole number of at least 1, got {value!r}")
-        checks.integer("PathGradient", "fresh_from", self.fresh_from, at_least=0)
+        checks.fields(self)
         if 0 < self.fresh_from < _WINDOW:
             raise InputError(f"PathGradient: fresh_from must be 0, or at least {_WINDOW}, got {self.fresh_from}")
         check_pixels("PathGradient", self.pixels, self.image, self.spp, self.adjoint_spp)
@@ -218,7 +214,7 @@ class StockState:
 
 @register
 @dataclass(frozen=True)
-class StockGradient:
+class StockGradient(checks.Checked):
     """The gradient of a standard Mitsuba loop: `mi.render` of each view, the loss, `dr.backward`, with independent samples for image
     and adjoint.
 
@@ -232,10 +228,7 @@ class StockGradient:
         spp: samples per pixel and view of the image, and again of the adjoint, >= 1.
     """
 
-    spp: int = 16
-
-    def __post_init__(self):
-        checks.integer("StockGradient", "spp", self.spp, at_least=1)
+    spp: Count = 16
 
     provides = Capabilities(Gradient)
 

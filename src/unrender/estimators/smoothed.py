@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from unrender.core import checks, trees
+from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -136,29 +137,22 @@ class SmoothedDerivatives:
     baseline: bool = True
     low_discrepancy: bool = False
     spp: int = 4
-    epsilon: float = 0.3
+    epsilon: Positive = 0.3
     schedule: Schedule | None = None
     adaptive_annealing: bool = False
     debiased: bool = False
-    hessian_rate: float | None = None
+    hessian_rate: Positive | None = None
     hessian_form: Literal["full", "diagonal"] = "full"
     orthogonal: bool = False
 
     def __post_init__(self):
-        checks.flags(self)
-        if self.order not in ("gradient", "hessian", "hvp"):
-            raise InputError(f'SmoothedDerivatives: order must be "gradient", "hessian" or "hvp", got {self.order!r}')
+        checks.fields(self)
         if self.product and self.order != "gradient":
             raise InputError(f'SmoothedDerivatives: product=True requires order="gradient", got {self.order!r}')
         for name, value in self.sigma.items() if isinstance(self.sigma, Mapping) else [("sigma", self.sigma)]:
             checks.number("SmoothedDerivatives", f"sigma of {name}" if name != "sigma" else name, value, above=0.0)
         checks.integer("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
         checks.integer("SmoothedDerivatives", "spp", self.spp, at_least=2 if self.debiased else 1)
-        checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
-        if self.hessian_form not in ("full", "diagonal"):
-            raise InputError(
-                f'SmoothedDerivatives: hessian_form must be "full" or "diagonal", got {self.hessian_form!r}'
-            )
         if self.hessian_form == "diagonal" and self.hessian_rate is None:
             raise InputError('SmoothedDerivatives: hessian_form="diagonal" requires hessian_rate')
         if self.order == "gradient":
@@ -169,7 +163,7 @@ class SmoothedDerivatives:
                 "SmoothedDerivatives: orthogonal requires aggregate, and neither low_discrepancy nor product"
             )
         if self.hessian_rate is not None:
-            if checks.number("SmoothedDerivatives", "hessian_rate", self.hessian_rate, above=0.0) > 1.0:
+            if self.hessian_rate > 1.0:
                 raise InputError(f"SmoothedDerivatives: hessian_rate must be at most 1, got {self.hessian_rate!r}")
             if self.order != "hvp":
                 raise InputError(f'SmoothedDerivatives: hessian_rate requires order="hvp", got {self.order!r}')

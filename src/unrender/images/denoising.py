@@ -16,6 +16,7 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import Several
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -191,11 +192,11 @@ class Denoised(WithoutSnapshot):
 
     inner: ImageEstimator = field(default_factory=Plain)
     by: Denoiser = "auto"
-    groups: int = 2
+    groups: Several = 2
     pixelwise = False  # a denoiser needs the neighbours of a pixel
 
     def __post_init__(self):
-        checks.integer("Denoised", "groups", self.groups, 2)
+        checks.fields(self)
         if isinstance(self.inner, (type, Denoised)):
             raise InputError(f"Denoised: inner must be an image estimator such as Plain(), got {self.inner!r}")
 

@@ -14,6 +14,7 @@ import numpy as np
 from unrender import statistics
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
+from unrender.core.checks import Count, Fraction
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -157,20 +158,15 @@ class RecursiveControlVariate:
     """
 
     space: Space = "path"
-    alpha: float = 0.9
-    beta: float = 0.999
-    whole_views: int = 20
+    alpha: Fraction = 0.9
+    beta: Fraction = 0.999
+    whole_views: Count = 20
     learn_from_draws: bool = True
     max_weight: float = 1.0
     pixelwise = True  # with a snapshot as control variate
 
     def __post_init__(self):
-        checks.flags(self)
-        checks.integer("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
-        if self.space not in ("path", "primary"):
-            raise InputError(f'RecursiveControlVariate: space must be "path" or "primary", got {self.space!r}')
-        for name in ("alpha", "beta"):
-            checks.number("RecursiveControlVariate", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
+        checks.fields(self)
         if not checks.number("RecursiveControlVariate", "max_weight", self.max_weight, above=0.0) <= 1:
             raise InputError(f"RecursiveControlVariate: max_weight must be in (0, 1], got {self.max_weight!r}")
 

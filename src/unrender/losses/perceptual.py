@@ -17,6 +17,7 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean, reason_of
@@ -59,11 +60,11 @@ class Perceptual:
 
     weights: str | Path | None = None
     layers: tuple[str, ...] = ("relu1_2", "relu2_2", "relu3_3")
-    strength: float = 1.0
+    strength: Positive = 1.0
     linear, pixelwise = False, False
 
     def __post_init__(self):
-        checks.number("Perceptual", "strength", self.strength, above=0.0)
+        checks.fields(self)
         if isinstance(self.layers, str) or not isinstance(self.layers, (list, tuple)) or not self.layers:
             raise InputError(f"Perceptual: layers must be a list of names such as relu3_3, got {self.layers!r}")
         for name in self.layers:

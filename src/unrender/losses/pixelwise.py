@@ -9,6 +9,7 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
@@ -47,7 +48,7 @@ class L2:
 
 @register(position=3)
 @dataclass(frozen=True)
-class RelativeL2:
+class RelativeL2(checks.Checked):
     """(I − R)² / (R² + ε): squared relative error.
 
     The denominator contains the reference only, not the noisy image, so the derivative is linear. The estimators sample the image and the
@@ -60,10 +61,7 @@ class RelativeL2:
 
     linear, pixelwise = True, True
 
-    epsilon: float = 1e-2
-
-    def __post_init__(self):
-        checks.number("RelativeL2", "epsilon", self.epsilon, above=0.0)
+    epsilon: Positive = 1e-2
 
     def value(self, image: Array, reference: Array) -> Array:
         difference = image - reference
@@ -75,7 +73,7 @@ class RelativeL2:
 
 @register(position=4)
 @dataclass(frozen=True)
-class Huber:
+class Huber(checks.Checked):
     """(I − R)²/2 for |I − R| <= δ, else δ (|I − R| − δ/2). The derivative is I − R clamped to [−δ, δ].
 
     Args:
@@ -84,10 +82,7 @@ class Huber:
 
     linear, pixelwise = False, True
 
-    delta: float = 0.1
-
-    def __post_init__(self):
-        checks.number("Huber", "delta", self.delta, above=0.0)
+    delta: Positive = 0.1
 
     def value(self, image: Array, reference: Array) -> Array:
         distance = arrays.absolute(image - reference)
@@ -117,11 +112,11 @@ class Censored:
     """
 
     loss: Loss = field(default_factory=L1)
-    white: float = 0.95
+    white: Positive = 0.95
     linear, pixelwise = False, True
 
     def __post_init__(self):
-        checks.number("Censored", "white", self.white, above=0.0)
+        checks.fields(self)
         if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
             raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {self.loss!r:.80}")
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import NotNegative, OpenFraction, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean
@@ -129,20 +130,16 @@ class AveragedNewton:
     """
 
     learning_rate: float = 1.0
-    averaging: float = 2.0
-    settled_averaging: float | None = None
-    trust_radius: float | None = 2.0
-    damping: float = 1e-3
+    averaging: NotNegative = 2.0
+    settled_averaging: NotNegative | None = None
+    trust_radius: Positive | None = 2.0
+    damping: OpenFraction = 1e-3
     linear: tuple[str, ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "linear", checked_keys("AveragedNewton: linear", self.linear))
         rates.check("AveragedNewton", self.learning_rate, None)
-        checks.number("AveragedNewton", "averaging", self.averaging, above=0.0, inclusive=True)
-        checks.number("AveragedNewton", "settled_averaging", self._growth(math.inf), above=0.0, inclusive=True)
-        checks.number("AveragedNewton", "damping", self.damping, above=0.0, below=1.0)
-        if self.trust_radius is not None:
-            checks.number("AveragedNewton", "trust_radius", self.trust_radius, above=0.0)
+        checks.fields(self)
 
     @property
     def requires(self) -> Capabilities:

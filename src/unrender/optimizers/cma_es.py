@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from unrender.core import checks, trees
+from unrender.core.checks import Index, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -78,19 +79,17 @@ class CMAES:
         learning_rate: η, in units of the parameter, > 0, for the parameters without their own; or {key: η, "*": η of the others}.
     """
 
-    sigma0: float = 0.3
+    sigma0: Positive = 0.3
     population: int | None = None
-    seed: int = 0
+    seed: Index = 0
     diagonal: bool = False
     learning_rate: float | Mapping[str, float] = 1.0
 
     def __post_init__(self):
         rates.check("CMAES", self.learning_rate, None)
-        checks.number("CMAES", "sigma0", self.sigma0, above=0.0)
-        checks.integer("CMAES", "seed", self.seed, at_least=0)
         if self.population is not None:
             checks.integer("CMAES", "population", self.population, at_least=4)
-        checks.flags(self)
+        checks.fields(self)
 
     @property
     def requires(self) -> Capabilities:

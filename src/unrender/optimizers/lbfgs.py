@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import Count, OpenFraction, Positive
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -71,18 +72,16 @@ class LBFGS:
     """
 
     learning_rate: float = 1.0
-    trust_radius: float = 0.5
-    history: int = 5
-    curvature: float = 0.01
+    trust_radius: Positive = 0.5
+    history: Count = 5
+    curvature: OpenFraction = 0.01
     step_scale: float = 1.0
     inner_optimizer: Adam | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
         check_options("LBFGS", self)
-        checks.number("LBFGS", "trust_radius", self.trust_radius, above=0.0)
-        checks.integer("LBFGS", "history", self.history, at_least=1)
-        checks.number("LBFGS", "curvature", self.curvature, above=0.0, below=1.0)
+        checks.fields(self)
 
     @property
     def requires(self) -> Capabilities:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import arrays, checks, conjugate_gradients, trees
+from unrender.core.checks import Count, Fraction, OpenFraction, Positive
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -82,17 +83,15 @@ class Newton:
     """
 
     learning_rate: float = 1.0
-    trust_radius: float | None = 0.5
-    damping: float = 0.1
+    trust_radius: Positive | None = 0.5
+    damping: OpenFraction = 0.1
     step_scale: float = 1.0
     inner_optimizer: Adam | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
         check_options("Newton", self)
-        checks.number("Newton", "damping", self.damping, above=0.0, below=1.0)
-        if self.trust_radius is not None:
-            checks.number("Newton", "trust_radius", self.trust_radius, above=0.0)
+        checks.fields(self)
 
     @property
     def requires(self) -> Capabilities:
@@ -159,22 +158,18 @@ class NewtonCG:
     """
 
     learning_rate: float = 1.0
-    trust_radius: float = 0.5
-    iterations: int = 4
-    tolerance: float = 0.1
-    damping: float = 0.1
+    trust_radius: Positive = 0.5
+    iterations: Count = 4
+    tolerance: Fraction = 0.1
+    damping: Fraction = 0.1
     step_scale: float = 1.0
     inner_optimizer: Adam | None = None
     schedule: Schedule | None = None
     line: bool = False
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         check_options("NewtonCG", self)
-        checks.number("NewtonCG", "trust_radius", self.trust_radius, above=0.0)
-        checks.integer("NewtonCG", "iterations", self.iterations, at_least=1)
-        checks.number("NewtonCG", "tolerance", self.tolerance, above=0.0, below=1.0, inclusive=True)
-        checks.number("NewtonCG", "damping", self.damping, above=0.0, below=1.0, inclusive=True)
 
     @property
     def requires(self) -> Capabilities:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from unrender.core import checks
+from unrender.core.checks import Fraction, NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -44,18 +45,15 @@ class Adam(Recipe):
     """
 
     learning_rate: float | Mapping[str, float] = 0.01
-    beta_1: float = 0.9
-    beta_2: float = 0.999
-    epsilon: float = 1e-8
+    beta_1: Fraction = 0.9
+    beta_2: Fraction = 0.999
+    epsilon: Positive = 1e-8
     schedule: Schedule | None = None
     uniform: bool = False
 
     def __post_init__(self):
         rates.check("Adam", self.learning_rate, self.schedule)
-        checks.number("Adam", "beta_1", self.beta_1, above=0.0, below=1.0, inclusive=True)
-        checks.number("Adam", "beta_2", self.beta_2, above=0.0, below=1.0, inclusive=True)
-        checks.number("Adam", "epsilon", self.epsilon, above=0.0)
-        checks.flags(self)
+        checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
         return GradientMean(self.beta_1), ScaleByRms(self.beta_2, self.epsilon, self.uniform)
@@ -76,12 +74,12 @@ class SGD(Recipe):
     """
 
     learning_rate: float | Mapping[str, float] = 0.01
-    momentum: float = 0.0
+    momentum: Fraction = 0.0
     schedule: Schedule | None = None
 
     def __post_init__(self):
         rates.check("SGD", self.learning_rate, self.schedule)
-        checks.number("SGD", "momentum", self.momentum, above=0.0, below=1.0, inclusive=True)
+        checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
         return (DecayingSum(self.momentum),)
@@ -113,12 +111,12 @@ class MetaAdam(Recipe):
     """
 
     learning_rate: float | Mapping[str, float] = 0.002
-    epsilon: float = 1e-24
+    epsilon: Positive = 1e-24
     schedule: Schedule | None = None
 
     def __post_init__(self):
         rates.check("MetaAdam", self.learning_rate, self.schedule)
-        checks.number("MetaAdam", "epsilon", self.epsilon, above=0.0)
+        checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
         return (ScaleByDeviation(self.epsilon),)
@@ -174,12 +172,12 @@ class ScheduleFree(Recipe):
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
-    beta: float = 0.9
-    beta_2: float = 0.95
-    epsilon: float = 1e-12
-    averaging: float = 2.0
-    growth: float = 0.1
-    decay: float = 1.5
+    beta: Fraction = 0.9
+    beta_2: Fraction = 0.95
+    epsilon: Positive = 1e-12
+    averaging: NotNegative = 2.0
+    growth: NotNegative = 0.1
+    decay: NotNegative = 1.5
     schedule: Schedule | None = None
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
@@ -190,14 +188,8 @@ class ScheduleFree(Recipe):
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         rates.check("ScheduleFree", self.learning_rate, self.schedule)
-        for name in ("beta", "beta_2"):
-            checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
-        checks.number("ScheduleFree", "epsilon", self.epsilon, above=0.0)
-        checks.number("ScheduleFree", "averaging", self.averaging, above=0.0, inclusive=True)
-        checks.number("ScheduleFree", "growth", self.growth, above=0.0, inclusive=True)
-        checks.number("ScheduleFree", "decay", self.decay, above=0.0, inclusive=True)
         keys = checked_keys("ScheduleFree: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
         object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import checks
+from unrender.core.checks import Count, Index
 from unrender.core.errors import InputError
 from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
@@ -38,24 +39,20 @@ class Options:
     keys: tuple[str, ...]
     image: ImageEstimator
     pixels: PixelSampler
-    spp: int
-    adjoint_spp: int | None
-    groups: int
+    spp: Count
+    adjoint_spp: Count | None
+    groups: Count
     coupled: bool
     sensors: tuple[int, ...]
     single: bool
     max_depth: int
-    seed: int
+    seed: Index
     references: tuple[Any, ...] = field(default=(), compare=False)
     loss: Any = field(default=None, compare=False)
 
     def __post_init__(self):
         owner = "Renderer"
-        checks.integer(owner, "spp", self.spp, at_least=1)
-        if self.adjoint_spp is not None:
-            checks.integer(owner, "adjoint_spp", self.adjoint_spp, at_least=1)
-        checks.integer(owner, "groups", self.groups, at_least=1)
-        checks.integer(owner, "seed", self.seed, at_least=0)
+        checks.fields(self, owner)
         if isinstance(self.image, type) or not callable(getattr(self.image, "estimate", None)):
             raise InputError(f"{owner}: image must be one of unrender.images, such as Plain(), got {self.image!r}")
         check_pixels(owner, self.pixels, self.image, self.spp)

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import checks
+from unrender.core.checks import Count, Index
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
+from unrender.pixels import uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.pixels.guided import GuidedOptions, GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
 from unrender.pixels.pixel_statistics import MapDenoiser, PixelStatistics
@@ -92,10 +94,10 @@ class Adaptive(_Guided):
             cost, because paths that leave the scene are cheap. λ accounts for the cost, too. Otherwise c_j = 1.
     """
 
-    count: int | None = None
-    levels: int = 0
-    refresh: int = 20
-    samples: int | None = None
+    count: Count | None = None
+    levels: Index = 0
+    refresh: Count = 20
+    samples: Count | None = None
     uniform: float | None = None
     stratified: bool = True
     relative: bool = True
@@ -104,16 +106,14 @@ class Adaptive(_Guided):
     by_cost: bool = True
 
     def __post_init__(self):
-        checks.flags(self)
-        self._sampler(_FEWEST if self.count is None else self.count).check()
+        checks.fields(self)
+        uniform_share.check("Adaptive", self.uniform)
 
-    def _sampler(self, count: int) -> GuidedSampler:
+    def _sampler_for(self, problem: Problem) -> GuidedSampler:
+        count = default_count(problem) if self.count is None else self.count
         options = GuidedOptions(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
         rule = _GradientVariance(self.levels, self.learn_from_draws, self.by_cost, needs_second_moment=True)
         return GuidedSampler("Adaptive", options, rule)
-
-    def _sampler_for(self, problem: Problem) -> GuidedSampler:
-        return self._sampler(default_count(problem) if self.count is None else self.count)
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
@@ -159,18 +159,18 @@ class LossProportional(_Guided, PixelSampler):
         count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.
     """
 
-    count: int
-    refresh: int = 20
-    samples: int | None = None
+    count: Count
+    refresh: Count = 20
+    samples: Count | None = None
     uniform: float = 0.1
     stratified: bool = True
     denoiser: MapDenoiser = "auto"
 
     def __post_init__(self):
-        checks.flags(self)
-        self._sampler_for(None).check()
+        checks.fields(self)
+        uniform_share.check("LossProportional", self.uniform)
 
-    def _sampler_for(self, problem: Problem | None) -> GuidedSampler:
+    def _sampler_for(self, problem: Problem) -> GuidedSampler:
         del problem
         own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
         return GuidedSampler("LossProportional", GuidedOptions(*own), _LossDerivative())

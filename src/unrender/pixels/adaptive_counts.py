@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from unrender.core import checks
+from unrender.core.checks import Count, Several
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -95,16 +96,14 @@ class AdaptiveCounts:
         by_cost: whether c_j = 1 + v / 2 for v vertices of a path, see `Adaptive`; otherwise c_j = 1.
     """
 
-    least: int = 2
-    refresh: int = 10
+    least: Several = 2
+    refresh: Count = 10
     uniform: float | None = None
     relative: bool = True
     by_cost: bool = True
 
     def __post_init__(self):
-        checks.flags(self)
-        checks.integer("AdaptiveCounts", "least", self.least, at_least=2)
-        checks.integer("AdaptiveCounts", "refresh", self.refresh, at_least=1)
+        checks.fields(self)
         uniform_share.check("AdaptiveCounts", self.uniform)
 
     def init(self, problem: Problem, parameters: Tree) -> AdaptiveCountsState:

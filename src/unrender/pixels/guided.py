@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from unrender.core import arrays, checks
-from unrender.core.errors import InputError
+from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, check_batch
-from unrender.pixels.pixel_statistics import MAP_DENOISERS, MapDenoiser, denoise_map
+from unrender.pixels.pixel_statistics import MapDenoiser, denoise_map
 from unrender.pixels.tiles import FACTORS, InverseCdfTable, Maps, Tiles, TileSamples, cut, finite
 from unrender.pixels.uniform_share import ShareEvidence
 from unrender.scene.batches import PixelSample
@@ -137,20 +136,6 @@ class GuidedSampler:
     owner: str
     options: GuidedOptions
     rule: ImportanceRule
-
-    def check(self) -> None:
-        """Raise `InputError` for options out of range."""
-        options = self.options
-        for name, value in (("count", options.count), ("refresh", options.refresh)):
-            checks.integer(self.owner, name, value, at_least=1)
-        checks.integer(self.owner, "levels", self.rule.levels, at_least=0)
-        if options.samples is not None:
-            checks.integer(self.owner, "samples", options.samples, at_least=1)
-        uniform_share.check(self.owner, options.uniform)
-        if options.denoiser not in MAP_DENOISERS:
-            raise InputError(
-                f"{self.owner}: denoiser must be auto, oidn, optix, pooling, variation or none, got {options.denoiser!r}"
-            )
 
     def init(self, problem: Problem) -> GuidedSamplerState:
         check_batch(self.owner, problem, self.options.count)

@@ -65,7 +65,6 @@ def _halved(x: np.ndarray) -> np.ndarray:
 
 
 MapDenoiser = Literal["auto", "oidn", "optix", "pooling", "variation", "none"]
-MAP_DENOISERS: tuple[MapDenoiser, ...] = ("auto", "oidn", "optix", "pooling", "variation", "none")
 
 _MARGIN = 4
 """Tiles of padding around each map if several are denoised in one image."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import arrays, checks
+from unrender.core.checks import Count
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -27,7 +28,7 @@ class UniformState(Unchanged):
 
 @register
 @dataclass(frozen=True)
-class Uniform(PixelSampler):
+class Uniform(checks.Checked, PixelSampler):
     """Uniform sampling of the pixels of all views. Unbiased.
 
     Args:
@@ -35,12 +36,8 @@ class Uniform(PixelSampler):
         stratified: whether samples are stratified over all pixels (`tiles.InverseCdfTable.draw`); independent otherwise.
     """
 
-    count: int
+    count: Count
     stratified: bool = True
-
-    def __post_init__(self):
-        checks.flags(self)
-        checks.integer("Uniform", "count", self.count, at_least=1)
 
     def init(self, problem: Problem, parameters: Tree) -> UniformState:
         del parameters
@@ -59,7 +56,7 @@ class Uniform(PixelSampler):
 
 @register
 @dataclass(frozen=True)
-class Views(PixelSampler):
+class Views(checks.Checked, PixelSampler):
     """Mini-batch of full views: each set of `count` views is equally likely, and all its pixels are rendered. Unbiased.
 
     It reduces costs that grow with the number of views, which mini-batches of pixels (`Uniform`) do not: boundary gradients of moving
@@ -69,10 +66,7 @@ class Views(PixelSampler):
         count: views per step, >= 1; all views if the problem has no more.
     """
 
-    count: int
-
-    def __post_init__(self):
-        checks.integer("Views", "count", self.count, at_least=1)
+    count: Count
 
     def init(self, problem: Problem, parameters: Tree) -> None:
         """Return None, as there is no state. Raises `InputError` for a loss that is not pixelwise."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, periodic
 from unrender.core.arrays import Array
+from unrender.core.checks import NotNegative
 from unrender.core.registry import register
 from unrender.preconditioners import grid
 from unrender.preconditioners.base import Around, around_axis
@@ -46,16 +47,14 @@ class Sobolev:
         correlation: √λ relative to N if no strength is given, >= 0.
     """
 
-    strength: float | None = None
+    strength: NotNegative | None = None
     wrap: bool | tuple[bool, ...] = False
-    correlation: float = 1 / 8
+    correlation: NotNegative = 1 / 8
     _spectrum: MeshSpectrum | None = field(default=None, init=False, repr=False, compare=False)
     _columns: int = field(default=0, init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        if self.strength is not None:
-            checks.number("Sobolev", "strength", self.strength, above=0.0, inclusive=True)
-        checks.number("Sobolev", "correlation", self.correlation, above=0.0, inclusive=True)
+        checks.fields(self)
         object.__setattr__(self, "wrap", grid.wraps("Sobolev", self.wrap))
 
     def on_mesh(self, topology: MeshTopology) -> Sobolev:
@@ -204,12 +203,12 @@ class LargeSteps:
             C) wraps as (False, True).
     """
 
-    strength: float = 10.0
+    strength: NotNegative = 10.0
     wrap: bool | tuple[bool, ...] = False
     _mesh: MeshTopology | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        checks.number("LargeSteps", "strength", self.strength, above=0.0, inclusive=True)
+        checks.fields(self)
         object.__setattr__(self, "wrap", grid.wraps("LargeSteps", self.wrap))
 
     def on_mesh(self, topology: MeshTopology) -> LargeSteps:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from unrender.core import checks, tables
+from unrender.core.checks import Several
 from unrender.core.errors import InputError
 from unrender.io import resampling
 
@@ -38,19 +39,17 @@ class CoarseToFine:
     """
 
     steps: tuple[int, ...]
-    factor: int = 2
+    factor: Several = 2
     wrap: bool | tuple[bool, ...] = False
     states: Literal["estimator", "carry", "reset"] = "estimator"
 
     def __post_init__(self):
         object.__setattr__(self, "steps", checked_steps("CoarseToFine", self.steps))
-        checks.integer("CoarseToFine", "factor", self.factor, at_least=2)
+        checks.fields(self)
         wrap = tuple(self.wrap) if isinstance(self.wrap, (list, tuple)) else self.wrap
         object.__setattr__(self, "wrap", wrap)
         if not all(isinstance(wraps, bool) for wraps in (wrap if isinstance(wrap, tuple) else (wrap,))):
             raise InputError(f"CoarseToFine: wrap must be true, false, or one of these per axis, got {wrap!r}")
-        if self.states not in ("estimator", "carry", "reset"):
-            raise InputError(f'CoarseToFine: states must be "estimator", "carry" or "reset", got {self.states!r}')
 
     def check(self, shape: tuple[int, ...]) -> None:
         """Raise `InputError` for a parameter of this (full) shape that cannot have coarser resolutions."""

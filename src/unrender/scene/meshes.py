@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from unrender.core import checks, tables
+from unrender.core.checks import NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.welding import weld
@@ -35,13 +36,12 @@ class MeshRegularizer:
         edges: e, >= 0; the same scale applies.
     """
 
-    bilaplacian: float = 0.0
-    edges: float = 0.0
+    bilaplacian: NotNegative = 0.0
+    edges: NotNegative = 0.0
     _mesh: _Mesh | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        for name in ("bilaplacian", "edges"):
-            checks.number("regularizer", name, getattr(self, name), above=0.0, inclusive=True)
+        checks.fields(self, "regularizer")
 
     def on_mesh(self, positions: np.ndarray, faces: np.ndarray) -> MeshRegularizer:
         """Return the regularizer for the vertex positions (3 V,) of a mesh with initial positions (V, 3) and faces (F, 3)."""
@@ -130,13 +130,11 @@ class Remeshing:
 
     steps: tuple[int, ...]
     method: Literal["isotropic", "subdivide"] = "isotropic"
-    edge: float = 0.5
+    edge: Positive = 0.5
 
     def __post_init__(self):
         object.__setattr__(self, "steps", checked_steps("Remeshing", self.steps))
-        if self.method not in ("isotropic", "subdivide"):
-            raise InputError(f'Remeshing: method must be "isotropic" or "subdivide", got {self.method!r}')
-        checks.number("Remeshing", "edge", self.edge, above=0.0)
+        checks.fields(self)
 
     def check(self, positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> None:
         """Raise `InputError` for an unsuitable mesh: positions (V, 3), faces (F, 3), texture coordinates (V, 2) or None."""

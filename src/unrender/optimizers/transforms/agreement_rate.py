@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import NotNegative
 from unrender.core.memory import inner_products
 from unrender.core.registry import register
 from unrender.core.text import listed
@@ -114,13 +115,12 @@ class AgreementRate(StepTransform):
         unsized: Keys of parameters whose growth does not raise the limit, such as those optimised as logarithms.
     """
 
-    growth: float = 0.1
-    decay: float = 1.5
+    growth: NotNegative = 0.1
+    decay: NotNegative = 1.5
     unsized: tuple[str, ...] = ()
 
     def __post_init__(self):
-        checks.number("AgreementRate", "growth", self.growth, above=0.0, inclusive=True)
-        checks.number("AgreementRate", "decay", self.decay, above=0.0, inclusive=True)
+        checks.fields(self)
         object.__setattr__(self, "unsized", checked_keys("AgreementRate: unsized", self.unsized))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Agreement:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
+from unrender.core.checks import Count
 from unrender.core.memory import inner_products
 from unrender.core.registry import register
 from unrender.core.text import listed
@@ -63,7 +64,7 @@ class GradientBlocks(TransformState):
 
 @register
 @dataclass(frozen=True)
-class LastingAgreement(StepTransform):
+class LastingAgreement(checks.Checked, StepTransform):
     """Estimate how much of the agreement of successive gradients is signal, for estimators that reuse samples.
 
     Reused noise correlates successive gradients. Gradients that are further apart than the memory of the estimator share the signal
@@ -95,10 +96,7 @@ class LastingAgreement(StepTransform):
         shortest: Number of steps of the shortest block, >= 1.
     """
 
-    shortest: int = 48
-
-    def __post_init__(self):
-        checks.integer("LastingAgreement", "shortest", self.shortest, at_least=1)
+    shortest: Count = 48
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientBlocks:
         del learning_rates

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from unrender.core import checks, trees
+from unrender.core.checks import Fraction
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.optimizers.transforms.base import GRADIENTS, StepTransform, StepUpdate, TransformState
@@ -24,7 +25,7 @@ class MeanDirection(TransformState):
 
 @register
 @dataclass(frozen=True)
-class GradientMean(StepTransform):
+class GradientMean(checks.Checked, StepTransform):
     """Replace the direction by its debiased exponentially weighted mean: m ← β₁ m + (1 − β₁) g (Kingma and Ba 2015).
 
     It has the unit of the direction. The step applies the debiasing (`StepUpdate.divisor`).
@@ -33,10 +34,7 @@ class GradientMean(StepTransform):
         decay: β₁, in [0, 1).
     """
 
-    decay: float = 0.9
-
-    def __post_init__(self):
-        checks.number("GradientMean", "decay", self.decay, above=0.0, below=1.0, inclusive=True)
+    decay: Fraction = 0.9
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanDirection:
         del learning_rates
@@ -61,7 +59,7 @@ class Velocity(TransformState):
 
 @register
 @dataclass(frozen=True)
-class DecayingSum(StepTransform):
+class DecayingSum(checks.Checked, StepTransform):
     """Replace the direction by its decaying sum: u ← μ u + g (Polyak's heavy ball).
 
     A constant direction g converges to g / (1 − μ).
@@ -70,10 +68,7 @@ class DecayingSum(StepTransform):
         momentum: μ, in [0, 1).
     """
 
-    momentum: float = 0.9
-
-    def __post_init__(self):
-        checks.number("DecayingSum", "momentum", self.momentum, above=0.0, below=1.0, inclusive=True)
+    momentum: Fraction = 0.9
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Velocity:
         del learning_rates

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.checks import Fraction, Positive
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import Capability, Variance
@@ -47,17 +48,15 @@ class ScaleByRms(StepTransform):
             gradients vanish (Reddi et al. 2018, "On the Convergence of Adam and Beyond").
     """
 
-    decay: float = 0.999
-    epsilon: float = 1e-8
+    decay: Fraction = 0.999
+    epsilon: Positive = 1e-8
     uniform: bool | tuple[str, ...] = False
     long_memory: bool = False
 
     def __post_init__(self):
-        checks.flags(self)
+        checks.fields(self)
         if not isinstance(self.uniform, bool):
             object.__setattr__(self, "uniform", checked_keys("ScaleByRms: uniform", self.uniform))
-        checks.number("ScaleByRms", "decay", self.decay, above=0.0, below=1.0, inclusive=True)
-        checks.number("ScaleByRms", "epsilon", self.epsilon, above=0.0)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanSquare:
         del learning_rates
@@ -96,7 +95,7 @@ class ScaleByRms(StepTransform):
 
 @register
 @dataclass(frozen=True)
-class ScaleByDeviation(StepTransform):
+class ScaleByDeviation(checks.Checked, StepTransform):
     """Divide the direction by √(Var g + ε), with the variance from the estimator (Balint et al. 2023, Eq. 21).
 
     The result has no unit.
@@ -105,10 +104,7 @@ class ScaleByDeviation(StepTransform):
         epsilon: ε, in squared units of the gradient, > 0.
     """
 
-    epsilon: float = 1e-24
-
-    def __post_init__(self):
-        checks.number("ScaleByDeviation", "epsilon", self.epsilon, above=0.0)
+    epsilon: Positive = 1e-24
 
     @property
     def requires(self) -> tuple[type[Capability], ...]:
@@ -127,17 +123,14 @@ class ScaleByDeviation(StepTransform):
 
 @register
 @dataclass(frozen=True)
-class ClipDirection(StepTransform):
+class ClipDirection(checks.Checked, StepTransform):
     """Clip every element of the direction.
 
     Args:
         longest: Largest magnitude of an element, in units of the direction, > 0.
     """
 
-    longest: float = 1.0
-
-    def __post_init__(self):
-        checks.number("ClipDirection", "longest", self.longest, above=0.0)
+    longest: Positive = 1.0
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
         del parameters, learning_rates

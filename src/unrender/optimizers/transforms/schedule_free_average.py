@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import Fraction, NotNegative
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.optimizers.transforms.base import VALUES, StepTransform, StepUpdate, TransformState
@@ -32,7 +33,7 @@ class Iterates(TransformState):
 
 @register
 @dataclass(frozen=True)
-class ScheduleFreeAverage(StepTransform):
+class ScheduleFreeAverage(checks.Checked, StepTransform):
     """Take steps on z, average z in x, and place the parameters y between the two. Must be the last transform of a chain.
 
         z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
@@ -45,12 +46,8 @@ class ScheduleFreeAverage(StepTransform):
         averaging: r, >= 0.
     """
 
-    beta: float = 0.9
-    averaging: float = 2.0
-
-    def __post_init__(self):
-        checks.number("ScheduleFreeAverage", "beta", self.beta, above=0.0, below=1.0, inclusive=True)
-        checks.number("ScheduleFreeAverage", "averaging", self.averaging, above=0.0, inclusive=True)
+    beta: Fraction = 0.9
+    averaging: NotNegative = 2.0
 
     @property
     def sets_steps(self) -> bool:

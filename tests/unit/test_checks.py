@@ -1,0 +1,72 @@
+"""Checks of components' options by the annotations of their fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import pytest
+
+from unrender.core import checks, registry
+from unrender.core.checks import Count, Fraction, Index, NotNegative, OpenFraction, Positive, Several
+from unrender.core.errors import InputError
+
+RANGES = ("Positive", "NotNegative", "Fraction", "OpenFraction", "Index", "Count", "Several", "bool", "Literal")
+
+
+@dataclass(frozen=True)
+class Options(checks.Checked):
+    rate: Positive = 1.0
+    pull: NotNegative = 0.0
+    decay: Fraction = 0.0
+    damping: OpenFraction = 0.5
+    seed: Index = 0
+    count: Count = 1
+    pair: Several | None = None
+    flag: bool = False
+    kind: Literal["a", "b"] | Literal["c"] | None = "a"
+    free: Any = None
+
+
+def test_values_within_the_ranges_are_taken() -> None:
+    Options(1e-9, 2.0, 0.999, 1e-9, 7, 3, 2, True, "c", "anything")
+    Options(kind=None, pair=None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("rate", 0.0, "rate must be a finite number > 0, got 0.0"),
+        ("rate", True, "rate must be a finite number > 0, got True"),
+        ("pull", -1.0, "pull must be a finite number >= 0, got -1.0"),
+        ("decay", 1.0, "decay must be a finite number >= 0 and < 1, got 1.0"),
+        ("damping", 0.0, "damping must be a finite number > 0 and < 1, got 0.0"),
+        ("seed", -1, "seed must be a whole number of at least 0, got -1"),
+        ("count", None, "count must be a whole number of at least 1, got None"),
+        ("pair", 1, "pair must be a whole number of at least 2, got 1"),
+        ("flag", 1, "flag must be true or false, got 1"),
+        ("kind", "d", """kind must be "a", "b" or "c", got 'd'"""),
+    ],
+)
+def test_others_are_refused_by_name(name: str, value: Any, expected: str) -> None:
+    with pytest.raises(InputError) as error:
+        Options(**{name: value})
+    assert str(error.value) == f"Options: {expected}"
+    part = Options()
+    object.__setattr__(part, name, value)
+    with pytest.raises(InputError, match=r"^table: "):
+        checks.fields(part, "table")
+
+
+@pytest.mark.mitsuba
+def test_every_annotated_range_of_a_component_is_found() -> None:
+    """An annotation that cannot be resolved when the program runs would silently go without its check."""
+    for kind in registry.KINDS:
+        for cls in registry.components(kind).values():
+            if getattr(cls, "__post_init__", None) is None:
+                continue
+            found = {name for name, *_ in checks._checked(cls)}
+            for each in fields(cls):
+                words = str(each.type).replace(" | None", "")
+                if words in RANGES or words.startswith("Literal["):
+                    assert each.name in found, (cls, each.name)
