@@ -293,7 +293,7 @@ def test_tasks_are_data_and_functions_go_by_name() -> None:
 
     cloudpickle = pytest.importorskip("ray").cloudpickle
     job = tasks.Job("room.toml", {"resolution": "16"}, True, "unrender sweep", "/sweep", "token")
-    run = tasks.RunTask("trial-000", "plain", {"spp": "2"}, 3, None, 0, 1, {0.5: 0.1})
+    run = tasks.RunTask("trial-000", "plain", {"spp": "2"}, 3, None, 0, 1)
     sent = cloudpickle.dumps((tasks.on_worker, job, [run]))
     words = [argument for _, argument, _ in pickletools.genops(sent) if isinstance(argument, str)]
     modules = {word for word in words if word.startswith(("unrender.", "ray", "builtins", "types", "cloudpickle"))}
