@@ -17,7 +17,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from unrender.core.errors import InputError
-from unrender.core.text import printable
+from unrender.core.text import did_you_mean, printable
 
 Positive = Annotated[float, 0.0]
 """Annotation of a field: a finite number > 0."""
@@ -70,7 +70,7 @@ def choice(owner: str, name: str, value: Any, *choices: str) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
     if value not in choices:
         words = " or ".join(", ".join(f'"{each}"' for each in choices).rsplit(", ", 1))
-        raise InputError(f"{owner}: {name} must be {words}, got {value!r:.80}")
+        raise InputError(f"{owner}: {name} must be {words}, got {value!r:.80}{did_you_mean(str(value), choices)}")
 
 
 def fields(part: Any, owner: str = "") -> None:
