@@ -24,7 +24,7 @@ from unrender.core import registry
 from unrender.display.pictures import png, shown_image
 from unrender.io import parameter_values
 from unrender.methods import method
-from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.mitsuba import turned_lights
 from unrender.runs.folder import schema
 from unrender.scene import toml_file, view_checks
 
@@ -141,7 +141,7 @@ FILES = {
     "Photographs": formats,
     "Axes of cameras": capture,
     "Photographs under known lights": lights,
-    "Turntable lights": turntable_light,
+    "Turned lights": turned_lights,
     "Unknowns of photographs": unknowns,
     "Exports": exporting,
     "Distributed runs": distributed,
