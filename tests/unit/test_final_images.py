@@ -443,6 +443,19 @@ def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_
         assert abs(down) < 0.1
 
 
+@pytest.mark.parametrize("clipped", [False, True])
+def test_a_few_bright_pixels_are_no_saturated_reference(clipped: bool) -> None:
+    """Rare bright samples of three pixels are missing in a reference of few samples; a saturated one has many equal largest values."""
+    rng = np.random.default_rng(0)
+    exact = rng.uniform(0.2, 0.58, (1, WIDE * WIDE, 3))
+    exact[0, [100, 700, 1300]] = 1.0
+    exact[0, :60] = 1.0 if clipped else exact[0, :60]
+    images = exact + 0.01 * rng.standard_normal((4, *exact.shape[1:]))
+    reference = np.minimum(exact[0], 0.6) - (0.0 if clipped else 0.02 * rng.random(exact.shape[1:]))
+    cause, _, _ = final_checks._as_if(images - reference, images, reference, np.ones(WIDE * WIDE), [(WIDE, WIDE)])
+    assert cause.endswith("were saturated at 0.6 (set the loss Censored)") if clipped else "saturated" not in cause
+
+
 @pytest.mark.parametrize("shift", [0, 1])
 @pytest.mark.parametrize("progress", [0.2, 0.7, 1.0])
 def test_a_dark_background_tells_of_a_misplaced_object(shift: int, progress: float) -> None:
