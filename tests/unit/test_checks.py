@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from unrender.core import checks, registry
@@ -33,6 +34,13 @@ def test_values_within_the_ranges_are_taken() -> None:
     Options(kind=None, pair=None)
 
 
+def test_numbers_of_numpy_become_pythons() -> None:
+    """Mitsuba refuses NumPy's integers: a run with `spp=np.int64(4)` ended in a traceback."""
+    made = Options(rate=np.float32(0.5), count=np.int64(4))  # pyright: ignore[reportArgumentType]
+    assert (type(made.rate), type(made.count)) == (float, int)
+    assert (made.rate, made.count) == (0.5, 4)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
@@ -45,6 +53,7 @@ def test_values_within_the_ranges_are_taken() -> None:
         ("count", None, "count must be a whole number of at least 1, got None"),
         ("pair", 1, "pair must be a whole number of at least 2, got 1"),
         ("flag", 1, "flag must be true or false, got 1"),
+        ("kind", np.zeros(2), 'kind must be "a", "b" or "c", got array([0., 0.])'),
         ("kind", "d", """kind must be "a", "b" or "c", got 'd'"""),
     ],
 )

@@ -68,7 +68,7 @@ def flag(owner: str, name: str, value: Any) -> None:
 
 def choice(owner: str, name: str, value: Any, *choices: str) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         words = " or ".join(", ".join(f'"{each}"' for each in choices).rsplit(", ", 1))
         raise InputError(f"{owner}: {name} must be {words}, got {value!r:.80}{did_you_mean(str(value), choices)}")
 
@@ -77,10 +77,15 @@ def fields(part: Any, owner: str = "") -> None:
     """Raise `InputError` unless each field of a dataclass instance fits its annotation.
 
     Checked are the ranges above, `bool` and `Literal`, each also with `| None`. `owner` is the name in messages; "" is the class's.
+    Numbers of other types, such as NumPy's, become Python's: Mitsuba takes no others.
     """
     for name, check, limits, optional in _checked(type(part)):
-        if not (optional and getattr(part, name) is None):
-            check(owner or type(part).__name__, name, getattr(part, name), *limits)
+        value = getattr(part, name)
+        if optional and value is None:
+            continue
+        checked = check(owner or type(part).__name__, name, value, *limits)
+        if checked is not None and type(value) not in (int, float):
+            object.__setattr__(part, name, checked)
 
 
 class Checked:

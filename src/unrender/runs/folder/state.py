@@ -324,9 +324,13 @@ def _class(name: str) -> type:
     home = sys.modules.get(module) if ours or module in registry.state_modules() else None
     kind = vars(home).get(word) if home is not None else None
     if not isinstance(kind, type) or kind.__module__ != module or not _is_state(kind):
-        how = "" if ours else "; install the package that registers its component, or import its module first"
+        how = (
+            "start the run again"
+            if ours
+            else "install the package that registers its component, or import its module first"
+        )
         raise InputError(
-            f"state: {name[:80]!r} is not a state of this version of {_PACKAGE}, nor of a registered component{how}"
+            f"state: {name[:80]!r} is not a state of this version of {_PACKAGE}, nor of a registered component; {how}"
         )
     return kind
 
