@@ -68,7 +68,7 @@ def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivati
 def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
     """The problem's scene and its `mi.traverse` parameters, for loops of stock Mitsuba on them."""
     pair = _mitsuba(problem).pair
-    return pair.previous, pair.previous_parameters
+    return pair.previous, pair.loaded(previous=True).parameters
 
 
 def scene_values(problem: ur.Problem, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -161,3 +161,15 @@ def test_fields_of_components_that_nothing_reads_are_refused(made: Any, line: st
     with pytest.raises(InputError) as caught:
         made()
     assert line in str(caught.value)
+
+
+def test_options_of_a_registered_method_are_not_judged_by_how_its_parts_look() -> None:
+    class Plain(Options):
+        """two numbers that no part shows"""
+
+        spp: int = 1
+
+        def build(self) -> Any:
+            return ur.PathGradient(), ur.optimizers.Adam()
+
+    assert Method("plain parts", Plain).start({"spp": 2})[0] == ur.PathGradient()

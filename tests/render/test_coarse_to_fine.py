@@ -688,7 +688,7 @@ class Scenes(ur.protocols.Callback):
 
     def on_step(self, run: Any, record):
         pair = run.problem.renderer.pair
-        states = pair.current_parameters, pair.previous_parameters
+        states = pair.current_parameters, pair.loaded(previous=True).parameters
         self.seen.append([(state[WALL].shape[0], state[SMOKE].shape[0]) for state in states])
 
 

@@ -102,6 +102,19 @@ def test_views_that_differ_by_more_are_worlds_and_unknown_rotations_turn_the_lig
     np.testing.assert_array_equal(ur.render(back, view=1, spp=4), ur.render(turned, view=1, spp=4))
 
 
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_all_views_of_a_camera_follow_its_unknowns(cameras: int) -> None:
+    """Copies of a camera for other rotations have no parameters: only the first view followed an unknown field of view."""
+    key = "camera_0.x_fov"
+    images = []
+    for fov in (40.0, 60.0):
+        made = problem("envmap", cameras, (COLOUR, key))
+        made = made.replaced(parameters=[ur.Parameter(COLOUR), ur.Parameter(key, initial=fov)])
+        images.append([ur.render(made, view=view, spp=64) for view in range(3)])
+    for view in range(3):
+        assert (difference(images[0][view], images[1][view]) > 0.05) is (view < 1 or cameras == 1)
+
+
 def test_an_expression_of_the_rotation_turns_the_light_as_described() -> None:
     """A view that knows what an expression sets is a world; the other view has the rotation of the expression."""
     views = [ur.View(np.zeros((8, 8, 3)), known={ROTATION: TURNS[0]}), ur.View(np.zeros((8, 8, 3)))]

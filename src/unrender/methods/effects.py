@@ -36,9 +36,11 @@ def check(options: BaseModel, name: str, decide: Decide) -> None:
 def has_effect(options: BaseModel, name: str, decide: Decide) -> bool:
     """Return whether an option has its default, or another value of it would decide something else.
 
-    Another value than the default counts, because the option may ask for what the method would choose anyway.
+    Another value than the default counts, because the option may ask for what the method would choose anyway. Options of registered methods
+    always count, because `repr` of their parts may not show them.
     """
-    if getattr(options, name) == type(options).model_fields[name].default:
+    ours = type(options).__module__.startswith("unrender.")
+    if not ours or getattr(options, name) == type(options).model_fields[name].default:
         return True
     own = repr(_outcome(options, decide))
     return any(repr(_outcome(other, decide)) != own for other in _others(options, name))
