@@ -173,3 +173,9 @@ def test_options_of_a_registered_method_are_not_judged_by_how_its_parts_look() -
             return ur.PathGradient(), ur.optimizers.Adam()
 
     assert Method("plain parts", Plain).start({"spp": 2})[0] == ur.PathGradient()
+
+
+@pytest.mark.parametrize("settings", [{"sigma": "0.2"}, {"sigma_schedule": "exponential(25,0.1)"}])
+def test_a_text_that_asks_for_the_default_in_other_words_is_no_option_without_effect(settings: dict[str, Any]) -> None:
+    made = problem()
+    assert method("smoothed").plan(made, settings).estimator is not None

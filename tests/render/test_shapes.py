@@ -364,3 +364,15 @@ def test_shadows_of_spheres_on_a_mesh_with_unknown_vertices_are_told() -> None:
         "ball: path gradients omit the motion of its shadow on thing, because it is not a mesh: load it as a mesh"
     ]
     assert lines([0.2, 0.9, 0.4], "cube") == lines([1.5, 0.9, 0.4]) == []  # a mesh, and beside the light
+
+
+def test_fog_and_a_distant_mirror_are_no_shadow_and_no_reflection() -> None:
+    """Null surfaces let rays pass: a fog sphere was said to cast a shadow, and a mirror out of sight to show a mesh within fog."""
+    fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.5}
+    place = mi.ScalarTransform4f().translate([0.2, 0.9, 0.4]).scale(0.2)
+    cloud = {"type": "sphere", "to_world": place, "bsdf": {"type": "null"}, "interior": fog}
+    away = mi.ScalarTransform4f().translate([50.0, 50.0, 50.0])
+    mirror = {"type": "rectangle", "to_world": away, "bsdf": {"type": "conductor"}}
+    around = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.7), "bsdf": {"type": "null"}, "interior": fog}
+    notices = MitsubaRenderer(scene(cloud=cloud, mirror=mirror, around=around), 2, [KEY]).notices
+    assert not [line for line in notices if "shadow" in line or "mirrors" in line]

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-_ROUNDING = 1e-6
-"""Distance of coincident points relative to the largest coordinate: some rounding errors in single precision."""
+_OF_SIZE, _OF_COORDINATE, _OF_NEIGHBOURS = 1e-6, 1.5e-7, 0.01
+"""Largest distance of coincident points: parts of the size and of the largest coordinate, which are rounding errors in single precision,
+and of the usual distance of neighbours, which details are not below."""
+_SAMPLE = 4096
+"""Number of points whose neighbours are looked at."""
 
 
 def weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +24,10 @@ def weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    i, j = KDTree(different).query_pairs(_ROUNDING * np.abs(different).max(), output_type="ndarray").T
+    tree = KDTree(different)
+    rounding = _OF_SIZE * np.ptp(different, axis=0).max() + _OF_COORDINATE * np.abs(different).max()
+    usual = float(np.median(tree.query(different[:: len(different) // _SAMPLE + 1], k=2)[0][:, 1]))
+    i, j = tree.query_pairs(min(rounding, _OF_NEIGHBOURS * usual), output_type="ndarray").T
     if not len(i):
         return first, places
     _, joined = connected_components(coo_matrix((np.ones(len(i)), (i, j)), (len(first),) * 2), directed=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,6 +13,9 @@ from unrender.core.errors import InputError
 
 Decide = Callable[[Any], Any]
 """Function that returns what options decide, an object that `repr` shows in full. Raises `InputError` for incompatible options."""
+
+
+_NUMBER = re.compile(r"\d+(\.\d*)?(e[-+]?\d+)?")
 
 
 def check(options: BaseModel, name: str, decide: Decide) -> None:
@@ -49,7 +53,11 @@ def has_effect(options: BaseModel, name: str, decide: Decide) -> bool:
 def _others(options: BaseModel, name: str) -> Iterator[BaseModel]:
     """Yield the options with other values of one of them: its default, its other choices, or other numbers."""
     own = getattr(options, name)
-    numbers = [2 * own, own / 2, own + 1] if isinstance(own, (int, float)) and not isinstance(own, bool) else []
+    numbers: list[Any] = []
+    if isinstance(own, str):
+        numbers = [_NUMBER.sub(lambda found: f"{2.0 * float(found[0]):g}", own)]
+    elif isinstance(own, (int, float)) and not isinstance(own, bool):
+        numbers = [2 * own, own / 2, own + 1]
     for value in [type(options).model_fields[name].default, *choices(options, name), *numbers]:
         if value != own and (changed := _changed(options, name, value)) is not None:
             yield changed

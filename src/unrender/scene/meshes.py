@@ -275,7 +275,8 @@ def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str
     """
     joined = weld(positions)[1][faces]
     flat = np.linalg.norm(area_normals(positions.astype(np.float64), faces), axis=1) == 0
-    sides = np.sort(joined[~flat][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    used = ~flat & (joined != np.roll(joined, 1, axis=1)).all(axis=1)
+    sides = np.sort(joined[used][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     crowded = int(np.sum(np.unique(sides, axis=0, return_counts=True)[1] > 2)) if len(sides) else 0
     words = [f"{crowded} edges of more than two faces"] if crowded else []
     words += [f"{int(flat.sum())} triangles without area"] if flat.any() else []

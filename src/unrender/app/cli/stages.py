@@ -110,7 +110,11 @@ def begin(
     check_seed("seed", stages.seed, len(stages.stages))
     for stage in stages.stages:
         try:
-            method(stage.method or stages.method).start(stages.settings_of(stage))
+            chosen, settings = method(stage.method or stages.method), stages.settings_of(stage)
+            if stages.settings:  # those that stages share may have no effect in this one
+                chosen.configure(settings).build()
+            else:
+                chosen.start(settings)
         except InputError as error:
             raise InputError(f"{file}: stage {stage.name}: {error}") from error
     if out is not None and out.resolve() == file.resolve().parent:

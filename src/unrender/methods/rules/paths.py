@@ -174,7 +174,7 @@ def perturbed(traits: Traits) -> Plan | None:
     if not traits.unreachable:
         return None
     reason = f"derivatives of a smoothed loss (method smoothed): {traits.unreachable}"
-    plan = method("smoothed").plan(traits.problem, {"sigma": traits.options.sigma})
+    plan = method("smoothed").configure({"sigma": traits.options.sigma}).plan(traits.problem)
     return replace(plan, reasons=(reason,))
 
 

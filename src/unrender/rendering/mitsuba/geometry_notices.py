@@ -32,7 +32,11 @@ def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
     """
     lines = []
     for mesh in _unknown_meshes(scene, keys):
-        rest = [shape for shape in scene.shapes() if shape is not mesh]
+        rest = [
+            shape
+            for shape in scene.shapes()
+            if shape is not mesh and not (_is_null(shape) and shape.interior_medium() is None)
+        ]
         edges = edges_of(mesh, None)
         if not rest or not len(edges.ends) or has_instances(scene):
             continue
@@ -87,19 +91,29 @@ def _seen(sensor: Any, scene: Any, meshes: list[Any]) -> np.ndarray:
     position = (mi.Point2f(number % _SIDE, number // _SIDE) + 0.5) / _SIDE
     # An irradiancemeter has no `sample_ray`.
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
-    ray, active, counts = mi.Ray3f(ray), mi.Bool(True), np.zeros((len(meshes), 2))
-    for hit in range(_HITS):
+    ray, active, specular, counts = mi.Ray3f(ray), mi.Bool(True), mi.Bool(False), np.zeros((len(meshes), 2))
+    for _ in range(_HITS):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         for index, mesh in enumerate(meshes):
             on = active & (si.shape == mi.ShapePtr(mesh))
-            counts[index, min(hit, 1)] += np.count_nonzero(np.array(on))
+            counts[index] += [np.count_nonzero(np.array(each)) for each in (on & ~specular, on & specular)]
             active &= ~on
         bs, _ = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-        active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)  # which contains Null
+        specular |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         ray = mi.Ray3f(si.spawn_ray(si.to_world(bs.wo)))
-        dr.eval(ray, active)
+        dr.eval(ray, active, specular)
     return counts
+
+
+def _is_null(shape: Any) -> bool:
+    """Return whether rays pass through a shape as if it were not there, but for its medium."""
+    flags, kinds = shape.bsdf().flags() if shape.bsdf() else mi.BSDFFlags.Null, mi.BSDFFlags
+    return not any(
+        mi.has_flag(flags, kind)
+        for kind in (kinds.Smooth, kinds.Delta1D, kinds.DeltaReflection, kinds.DeltaTransmission)
+    )
 
 
 _POINTS, _SHADED = 4096, 0.01
@@ -113,9 +127,12 @@ def shadow_notices(scene: Any, keys: Collection[str]) -> list[str]:
         scene: `mi.Scene`.
         keys: the unknown parameters.
     """
-    round_ones = [shape for shape in scene.shapes() if not (shape.is_mesh() or shape.is_emitter() or shape.is_sensor())]
-    meshes, lines = _unknown_meshes(scene, keys) if scene.emitters() and not has_instances(scene) else [], []
-    for mesh in meshes:
+    others = [shape for shape in scene.shapes() if not (shape.is_mesh() or shape.is_emitter() or shape.is_sensor())]
+    round_ones, lines = [shape for shape in others if not _is_null(shape)], []
+    known = bool(round_ones and scene.emitters()) and not has_instances(scene)
+    for mesh in _unknown_meshes(scene, keys) if known else []:
+        if not mesh.face_count():
+            continue
         samples = np.random.default_rng(0).uniform(0.0, 1.0, (2, 2, _POINTS)).astype(np.float32)
         at = mesh.sample_position(0.0, mi.Point2f(samples[0]))
         si = dr.zeros(mi.SurfaceInteraction3f, _POINTS)
