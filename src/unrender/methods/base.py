@@ -106,7 +106,7 @@ class Method:
             parts = options.build()
             if self.options.plan is Options.plan:  # otherwise the problem decides which options have an effect
                 for name in settings or {}:
-                    effects.check(options, name, lambda one: one.build())
+                    effects.check(options, name, lambda one: one.build(), parts)
             return parts
 
     def plan(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Plan:
@@ -115,16 +115,16 @@ class Method:
         with self._named():
             plan = options.plan(problem)
             for name in settings or {}:
-                effects.check(options, name, lambda one: _decisions(one.plan(problem)))
+                effects.check(options, name, lambda one: _decisions(one.plan(problem)), _decisions(plan))
             return plan
 
     def with_effect(self, problem: Problem, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings that change the plan for a problem. Raises `InputError`."""
         options = self.configure(settings)
         with self._named():
-            options.plan(problem)
             decide: effects.Decide = lambda one: _decisions(one.plan(problem))  # noqa: E731
-            return {name: x for name, x in settings.items() if effects.has_effect(options, name, decide)}
+            decided = decide(options)
+            return {name: x for name, x in settings.items() if effects.has_effect(options, name, decide, decided)}
 
     @contextmanager
     def _named(self) -> Iterator[None]:

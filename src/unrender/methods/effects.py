@@ -18,17 +18,17 @@ Decide = Callable[[Any], Any]
 _NUMBER = re.compile(r"\d+(\.\d*)?(e[-+]?\d+)?")
 
 
-def check(options: BaseModel, name: str, decide: Decide) -> None:
-    """Raise `InputError` for an option without effect, and say which other options it needs."""
-    if has_effect(options, name, decide):
+def check(options: BaseModel, name: str, decide: Decide, decided: Any) -> None:
+    """Raise `InputError` for an option without effect, and say which other options it needs. `decided` is what the options decide."""
+    if has_effect(options, name, decide, decided):
         return
     needed, beside = [], []
     for other in type(options).model_fields:
         for value in choices(options, other) if other != name else ():
             changed = _changed(options, other, value)
-            if changed is None or isinstance(_outcome(changed, decide), InputError):
+            if changed is None or isinstance(then := _outcome(changed, decide), InputError):
                 continue
-            if has_effect(changed, name, decide):
+            if has_effect(changed, name, decide, then):
                 needed.append(f"{other}={_text(value)}")
                 beside.append(f"{other}={_text(getattr(options, other))}")
     if needed:
@@ -37,7 +37,7 @@ def check(options: BaseModel, name: str, decide: Decide) -> None:
     raise InputError(f"option {name} has no effect with these options on this problem; leave it out")
 
 
-def has_effect(options: BaseModel, name: str, decide: Decide) -> bool:
+def has_effect(options: BaseModel, name: str, decide: Decide, decided: Any) -> bool:
     """Return whether an option has its default, or another value of it would decide something else.
 
     Another value than the default counts, because the option may ask for what the method would choose anyway. Options of registered methods
@@ -46,8 +46,7 @@ def has_effect(options: BaseModel, name: str, decide: Decide) -> bool:
     ours = type(options).__module__.startswith("unrender.")
     if not ours or getattr(options, name) == type(options).model_fields[name].default:
         return True
-    own = repr(_outcome(options, decide))
-    return any(repr(_outcome(other, decide)) != own for other in _others(options, name))
+    return any(repr(_outcome(other, decide)) != repr(decided) for other in _others(options, name))
 
 
 def _others(options: BaseModel, name: str) -> Iterator[BaseModel]:

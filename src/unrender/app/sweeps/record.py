@@ -156,9 +156,9 @@ def read_sweep(folder: Path) -> SweepRecord:
     """Return the record in the folder of a sweep. Raises `InputError` if no record exists, or it is malformed."""
     if bounded_files.kind(folder / SWEEP) != "file":
         raise InputError(f"{folder}: holds no sweep ({SWEEP} is missing)")
-    found = bounded_files.read_object(folder / SWEEP, folder)
+    content = bounded_files.read_object(folder / SWEEP, folder)
     try:
-        record = schema.validate(SweepRecord, found, str(folder / SWEEP))
+        record = schema.validate(SweepRecord, content, str(folder / SWEEP))
     except InputError as error:
         raise InputError(f"{error}; start the sweep again if another version of unrender made it") from error
     numbers = [trial.number for trial in record.trials]
