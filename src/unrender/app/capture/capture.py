@@ -49,13 +49,8 @@ _NONE = np.zeros(0, np.float32)
 
 
 class StoredViews:
-    """Views with or without masks in a temporary file, each read on access, so that memory does not grow with their number.
-
-    Names, poses and lenses stay in memory.
-
-    Args:
-        views: consumed one by one.
-    """
+    """Views in a temporary file, each read on access, so that memory does not grow with their number. Names, poses and lenses stay in
+    memory."""
 
     def __init__(self, views: Iterable[CapturedView] = ()):
         self._store = PictureStore()
@@ -126,15 +121,8 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Capture:
-    """Posed photographs.
-
-    Attributes:
-        kind: name of the format.
-        photographs: at least one.
-        axes: camera axes in the files, a key of `conventions.AXES`.
-        world_to_camera: whether the files contain the inverse of a camera's pose.
-        notices: one line for each omission or change.
-    """
+    """Posed photographs, at least one, of a format. `axes` are the camera axes in the files, a key of `conventions.AXES`, whose matrices
+    are inverse poses if `world_to_camera`."""
 
     folder: Path
     kind: str

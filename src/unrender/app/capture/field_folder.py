@@ -57,15 +57,10 @@ _LIGHT_SIZE = 16, 32
 
 
 def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centre (3,) and half the side of the cube that the cameras look at.
+    """Return the centre (3,) and half the side of the cube that the cameras (V, 4, 4) look at.
 
-    The centre is nearest to all optical axes, by least squares. Half the side is its median distance from the cameras.
-
-    Args:
-        cameras: poses (V, 4, 4), axes right, up, backwards.
-
-    Raises:
-        InputError: the cameras look in parallel, or away from the centre.
+    The centre is nearest to all optical axes, by least squares. Half the side is its median distance from the cameras. Raises `InputError`
+    if the cameras look in parallel, or away from the centre.
     """
     places, views = cameras[:, :3, 3], -cameras[:, :3, 2]
     across = np.eye(3) - views[:, :, None] * views[:, None, :]
@@ -81,17 +76,8 @@ def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequence[str]) -> None:
-    """Write the problem and its stages, coarse to fine, to an empty folder.
-
-    Args:
-        folder: an existing folder.
-        views: views of the photographs; their masks are not used.
-        voxels: number of voxels along a side of the cube.
-        chosen: the unknowns, from `NAMES`.
-
-    Raises:
-        InputError: the cameras have no common focus.
-    """
+    """Write the problem of `chosen` unknowns, from `NAMES`, and its stages, coarse to fine, to an empty folder; masks are not used. Raises
+    `InputError` if the cameras have no common focus."""
     bare = views.bare()
     middle, half = cube_of(np.array([view.camera_to_world for view in bare]))
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(bare)]

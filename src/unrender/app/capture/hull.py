@@ -35,13 +35,7 @@ Camera = tuple[Lens, np.ndarray]
 def shape(views: CapturedViews, resolution: int, faces: int) -> Mesh:
     """Return an initial shape from the masks of `views`: the hull without components of less than 2 % of its faces, smoothed and decimated.
 
-    Args:
-        views: views with masks.
-        resolution: number of voxels along the longest side of the hull's bounding box.
-        faces: approximate number of triangles.
-
-    Raises:
-        InputError: no point is inside all masks.
+    It has about `faces` triangles, from `resolution` voxels along the longest side. Raises `InputError` if no point is inside all masks.
     """
     return decimate(smooth(without_crumbs(visual_hull(views, resolution), _CRUMBS), _SMOOTHING), faces)
 
@@ -191,13 +185,7 @@ _SCALES = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
 
 @dataclass(frozen=True)
 class Trial:
-    """Another reading of the same files.
-
-    Attributes:
-        what: the convention, for a message.
-        remedy: what to type.
-        overlap: mean intersection over union with the masks.
-    """
+    """Another reading of the same files: its convention, what to type, and the mean intersection over union with the masks."""
 
     what: str
     remedy: str

@@ -273,11 +273,7 @@ def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tupl
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
     """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one contact sheet.
 
-    Returns:
-        The result, and one line about the convention that seems wrong; "" if none does.
-
-    Raises:
-        InputError: as in `import_capture`.
+    Returns the result, and one line about the convention that seems wrong; "" if none does. Raises `InputError` as `import_capture` does.
     """
     _check_place(out, folder, options, _OF_CHECK)
     if formats.is_lit(folder, options.kind):

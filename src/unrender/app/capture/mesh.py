@@ -162,18 +162,10 @@ def check_atlas_installed() -> None:
 
 
 def unwrap(mesh: Mesh, resolution: int, seconds: float = _SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
-    """Return the mesh with texture coordinates: one atlas without overlaps, with charts about 2 texels apart.
+    """Return the mesh with texture coordinates: one atlas without overlaps, with charts about 2 of `resolution` texels apart.
 
-    Vertices on seams are duplicated. Normals do not change.
-
-    Args:
-        mesh: at most 2^31 faces.
-        resolution: texels along the atlas's sides.
-        seconds: time limit.
-        command: command of the subprocess, to which two file names are appended.
-
-    Raises:
-        InputError: xatlas is not installed, fails, or exceeds the time limit.
+    Vertices on seams are duplicated. Normals do not change. Raises `InputError` if xatlas is not installed, fails, or exceeds the time
+    limit.
     """
     check_atlas_installed()
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2

@@ -164,15 +164,8 @@ _DISTANCE = 100.0
 
 
 def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> None:
-    """Write the problem to an empty folder.
-
-    Args:
-        folder: an existing folder.
-        chosen: the unknowns, from `NAMES`.
-
-    Raises:
-        InputError: the mask covers no pixel completely, or an unknown is not supported.
-    """
+    """Write the problem of `chosen` unknowns, from `NAMES`, to an empty folder. Raises `InputError` if the mask covers no pixel completely,
+    or an unknown is not supported."""
     if others := [one for one in chosen if one not in NAMES]:
         raise InputError(
             f"--unknowns {others[0]}: for one camera under known lights, expected some of {', '.join(NAMES)}"

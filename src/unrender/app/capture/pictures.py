@@ -55,10 +55,8 @@ class Pixels:
 
 
 def _stored_size(path: Path) -> tuple[int, int, int]:
-    """Return width and height of the stored pixels, and EXIF's orientation (1 if absent), from the file's header.
-
-    Raises `InputError` if the file is not a picture, or is too large.
-    """
+    """Return width, height and EXIF's orientation (1 if absent) from a file's header. Raises `InputError` for no picture or one that is too
+    large."""
     if path.suffix.lower() in _RAW:
         raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
     if bounded_files.kind(path) != "file":
@@ -78,15 +76,8 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
 
 
 def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
-    """Read a photograph. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
-
-    Args:
-        orientation: EXIF orientation to apply; 1 for none.
-        response: response of integers, see `decode`.
-
-    Raises:
-        InputError: the file cannot be read completely.
-    """
+    """Read a photograph of an EXIF orientation. Integers of 8 and 16 bits are decoded by `response`, floating-point numbers are linear;
+    CMYK becomes RGB. Raises `InputError` if the file cannot be read completely."""
     array = _decode(path)
     if array is None:
         picture = _by_mitsuba(path)
@@ -118,13 +109,10 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
 
 
 def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
-    """Return width, height and orientation with which a photograph has the lens's aspect ratio.
+    """Return width, height and orientation with which a photograph has the lens's aspect ratio. Raises `InputError` if there are none.
 
     Cameras are calibrated on pixels, and most programs use them as stored. EXIF's orientation is therefore applied only if the rotated
     picture has the lens's aspect ratio and the stored one does not.
-
-    Raises:
-        InputError: neither the stored nor the rotated picture has it.
     """
     width, height, orientation = _stored_size(path)
     if lens is None or _proportional(width, height, lens):

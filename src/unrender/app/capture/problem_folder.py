@@ -46,18 +46,10 @@ def write(
     band: int = 0,
     turntable: bool = False,
 ) -> None:
-    """Write the problem and its stages to an empty folder.
+    """Write the problem of `chosen` unknowns and its stages to an empty folder, with textures of `texture` texels a side.
 
-    Args:
-        folder: an existing folder.
-        mesh: mesh with texture coordinates.
-        texture: texels along the sides of the textures.
-        chosen: the unknowns, from `unknowns.NAMES`.
-        band: width in pixels of the border of training masks with reduced weight.
-        turntable: whether the light is fixed relative to the cameras.
-
-    Raises:
-        InputError: a mask covers no pixel completely.
+    Training masks have a border of `band` pixels with reduced weight. The light of a `turntable` is fixed relative to the cameras. Raises
+    `InputError` if a mask covers no pixel completely.
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))

@@ -14,11 +14,8 @@ from unrender.losses.metrics import srgb
 
 
 class Silhouettes:
-    """Intersections of rays through pixel centres with a mesh.
-
-    Args:
-        mesh: it is centred and scaled to a unit box internally, so that single precision suffices at any position.
-    """
+    """Intersections of rays through pixel centres with a mesh, centred and scaled to a unit box, so that single precision suffices at any
+    position."""
 
     def __init__(self, mesh: Mesh):
         import mitsuba as mi

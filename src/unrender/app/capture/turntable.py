@@ -23,11 +23,7 @@ _LEVEL = 0.98
 
 
 def axis(poses: np.ndarray) -> np.ndarray:
-    """Return the table's axis, upwards, (3,) unit: the world direction that varies least in camera coordinates.
-
-    Args:
-        poses: (N, 4, 4) camera to world, axes right, up, backwards.
-    """
+    """Return the table's axis upwards, (3,) unit: the world direction that varies least in camera coordinates of poses (N, 4, 4)."""
     mean = np.mean(poses[:, :3, :3].transpose(0, 2, 1), 0)
     direction = np.linalg.svd(mean)[2][0]
     return direction if (mean @ direction)[1] >= 0 else -direction

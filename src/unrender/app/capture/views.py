@@ -164,10 +164,8 @@ _SIDE = 8192
 def pinhole(lens: Lens, scale: float) -> Lens:
     """Return the camera of the result: no distortion, square pixels, and `scale` times as many along each side, in (0, 1].
 
-    The scale is exactly equal along both sides: a fractional last pixel is cropped. The focal length is the geometric mean of both.
-
-    Raises:
-        InputError: no complete pixel remains along a side.
+    The scale is exactly equal along both sides: a fractional last pixel is cropped. The focal length is the geometric mean of both. Raises
+    `InputError` if no complete pixel remains along a side.
     """
     width, height = (math.floor(scale * side + 1e-9) for side in (lens.width, lens.height))
     if min(width, height) < 1:
@@ -180,11 +178,7 @@ def pinhole(lens: Lens, scale: float) -> Lens:
 
 @dataclass(frozen=True)
 class Resampling:
-    """A resampling of the picture of a lens to that of a pinhole camera.
-
-    Attributes:
-        target: pinhole of the result, with square pixels, as from `pinhole`.
-    """
+    """A resampling of the picture of a lens to that of a pinhole camera with square pixels, as from `pinhole`."""
 
     source: Lens
     target: Lens

@@ -90,12 +90,7 @@ def add_value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
 def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bool = False) -> None:
     """Add a bitmap texture as the property `name` of a BSDF.
 
-    Args:
-        parent: the BSDF.
-        name: name of the property.
-        file: path inside the texture folder.
-        raw: whether the values are not colours.
-        pixels: whether texels are pixels of a picture, whose first row is at v = 1. Then they are not interpolated.
+    The values of `raw` textures are not colours. Texels that are `pixels` of a picture, whose first row is at v = 1, are not interpolated.
     """
     texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
     for key, value in (("filename", f"{TEXTURES}/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):

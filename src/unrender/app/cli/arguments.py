@@ -247,11 +247,7 @@ def refuse_stages(file: str) -> None:
 
 
 def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
-    """Open the problem of a TOML file or of the gallery. A variant must be active. Raise `InputError`.
-
-    Args:
-        cached: whether its references are read from and written to the cache.
-    """
+    """Open the problem of a TOML file or of the gallery, its references `cached` or not. A variant must be active. Raise `InputError`."""
     with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():
         from unrender import gallery
         from unrender.scene.problem import Problem

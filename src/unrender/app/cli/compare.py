@@ -182,11 +182,8 @@ def _compare_folders(
 def _run_all(
     console: Console, progress: Progress, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
 ) -> tuple[list[Path], int]:
-    """Carry out the runs, here or on workers, until one is interrupted.
-
-    Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, of one that failed, or of one
-    that is doubtful, else 0.
-    """
+    """Carry out the runs, here or on workers, until one is interrupted. Return the folders of runs that took a step, and `status_of`
+    all."""
     from unrender.app.cli.execute import introduce
     from unrender.runs.folder import schema
 

@@ -37,11 +37,8 @@ _SEED = 1
 
 
 def doctor(console: Console | None = None) -> int:
-    """Print versions, hardware, the selected backend, a gradient test against finite differences, and missing packages.
-
-    Returns:
-        The exit status: 0 if everything that is needed works, else 3.
-    """
+    """Print versions, hardware, the selected backend, a gradient test against finite differences, and missing packages. Return the exit
+    status: 0 if everything that is needed works, else 3."""
     console = console or Console()
     problem: str | None = None
     backend = "none"
@@ -165,10 +162,7 @@ def _cache() -> list[tuple[str, str]]:
 
 
 def _missing() -> list[str]:
-    """Return one line per optional feature with missing packages that support this Python, with the installation command.
-
-    pip reads the extras of the installed package, so the command needs no index that has this package.
-    """
+    """Return one line per optional feature with missing packages that support this Python, with pip's command, which needs no index."""
     from packaging.requirements import InvalidRequirement, Requirement
 
     try:

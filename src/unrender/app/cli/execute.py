@@ -35,14 +35,8 @@ from unrender.statistics import debiased
 class RunOrder:
     """Specification of a run.
 
-    Attributes:
-        settings: settings of the method that differ from the defaults.
-        steps, seed: see `optimize`.
-        seconds: time limit with compilation and final pictures; None for no limit.
-        final_spp: samples per pixel of the final pictures; None for an automatic choice.
-        command: typed command, which is saved with the results.
-        problem_settings: options of a gallery problem, which are saved with the results.
-        checkpoint_every: see `optimize`.
+    The settings are those that differ from the defaults. The time limit `seconds`, or None, includes compilation and final pictures.
+    Command and problem settings are saved with the results. See `optimize` for the others.
     """
 
     method: Method | PlanFile

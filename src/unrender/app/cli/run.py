@@ -147,15 +147,9 @@ def conclude(
     again: Path | None = None,
     page: bool = True,
 ) -> None:
-    """Write the page and print a summary.
+    """Write the page, unless `page` is False, and print a summary; `again` is the argument of `unrender resume`, None for the run folder.
 
-    Args:
-        console, problem, result, folder, progress: output, problem, result, folder and phases of the run.
-        again: argument of `unrender resume` for the run; None for the run folder.
-        page: whether to write the page.
-
-    Raises:
-        typer.Exit: the run was interrupted, failed, or is doubtful.
+    Raises `typer.Exit` if the run was interrupted, failed, or is doubtful.
     """
     from unrender.app.cli.execute import summarise
 

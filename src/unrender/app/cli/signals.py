@@ -43,13 +43,9 @@ _SHOW_CURSOR = b"\x1b[?25h"
 
 
 class Signals:
-    """Handles SIGINT and SIGTERM within its context, in the main thread.
+    """Handles SIGINT and SIGTERM within its context, in the main thread. `status` is 130 or 143 after the first signal, else 0.
 
-    Args:
-        process: whether the process ends with the command. Later signals are then ignored, because all files are written.
-
-    Attributes:
-        status: exit status of the first signal, 130 or 143; 0 without a signal.
+    If the `process` ends with the command, later signals are ignored, because all files are written.
     """
 
     def __init__(self, process: bool):
@@ -104,11 +100,7 @@ class Signals:
 
 
 class _Watch:
-    """Thread that receives signals immediately, even if compiled code keeps the main thread from handling them.
-
-    Attributes:
-        own: number of expected signals that the process sent to itself.
-    """
+    """Thread that receives signals at once, even while compiled code keeps the main thread from it; `own` counts those sent to itself."""
 
     def __init__(self) -> None:
         self.own = 0

@@ -35,14 +35,7 @@ _SCENES = "scenes"
 
 @dataclass(frozen=True)
 class StagesRun:
-    """A run in stages in progress.
-
-    Attributes:
-        stages: stages with their budget and run options.
-        variant: Mitsuba variant.
-        command: typed command, which is saved with the results.
-        lock: held lock of `out`; `run_remaining` releases it.
-    """
+    """A run in stages in progress. `run_remaining` releases its lock, and results contain the typed command."""
 
     stages: Stages
     problem: StagedProblem
@@ -89,15 +82,9 @@ def begin(
     checkpoint_every: int | None,
     final_spp: int | None,
 ) -> StagesRun:
-    """Check a file of stages, and write the folder of its run. Raise `InputError`.
+    """Check a file of stages, and write the folder `out` of its run, a new one if None. Raise `InputError`.
 
-    Args:
-        file: an existing file.
-        budget: steps and seconds instead of the file's; both None for the file's.
-        seed: seed of the first stage; None for the file's.
-        out: the folder; None for a new one.
-        overwrite: whether it may contain earlier results.
-        variant, threads, command, checkpoint_every, final_spp: options of all stages.
+    None as `seed`, and a budget of two None, select the file's values.
     """
     from unrender.app.stages import stages_file
     from unrender.methods import method

@@ -148,13 +148,8 @@ _WINDOW = 4
 
 @dataclass(frozen=True)
 class Session:
-    """One call of the command.
-
-    Attributes:
-        workers: workers that run the trials; None for this process.
-        threads: processor threads per run; None for an automatic choice.
-        fresh: whether the sweep starts from the beginning, regardless of the folder's contents.
-    """
+    """One call of the command: workers or None for this process, threads per run, and whether the sweep starts `fresh` regardless of its
+    folder."""
 
     folder: Path
     workers: Workers | None

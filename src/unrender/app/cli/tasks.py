@@ -39,12 +39,8 @@ _MARK = ".unrender-folder"
 class Job:
     """Common data of all tasks of a command. It is serialisable.
 
-    Attributes:
-        problem, problem_settings, cached: see `arguments.open_problem`; a file's path is absolute.
-        command: typed command.
-        folder: output folder, an absolute path.
-        token: contents of the file `.unrender-folder` in it: a worker that reads something else, or nothing, sends its results back.
-        variant, threads: Mitsuba variant and processor threads of the workers.
+    The paths of a problem file and of the folder are absolute. A worker that does not read the `token` in its file `.unrender-folder` sends
+    its results back. Variant and threads are those of the workers.
     """
 
     problem: str
@@ -59,12 +55,7 @@ class Job:
 
 @dataclass(frozen=True)
 class RunTask:
-    """One run. It is serialisable.
-
-    Attributes:
-        method, settings: as typed.
-        steps, seconds, seed, final_spp: see `RunOrder`.
-    """
+    """One run, as typed: see `RunOrder`. It is serialisable."""
 
     name: str
     method: str
@@ -131,11 +122,8 @@ def outcome(folder: Path, task: RunTask, start: Mapping[str, float], wall_second
 
 
 def on_worker(job: Job, tasks: Sequence[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
-    """Run tasks in turn, until one does not complete.
-
-    Returns:
-        Their outcomes; and, if the job's folder is not shared, {path within it: contents} of the written files.
-    """
+    """Run tasks in turn, until one does not complete. Return their outcomes; and, if the job's folder is not shared, {path within it:
+    contents} of the written files."""
     prepare_worker(job.variant, job.threads)
     problem = _problem(job.problem, tuple(job.problem_settings.items()), job.cached)
     mark = Path(job.folder, _MARK)
@@ -197,12 +185,7 @@ def _finite(number: float | None) -> Any:
 
 
 class TaskDisplay:
-    """Prints a line for each task that has ended. `unrender watch` shows those that run.
-
-    Args:
-        console: output console.
-        ended: number of tasks that had ended before.
-    """
+    """Prints a line for each task that has ended, after those that had `ended` before. `unrender watch` shows those that run."""
 
     def __init__(self, console: Console, total: int, ended: int = 0):
         self._console, self._total, self._ended = console, total, ended

@@ -18,13 +18,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Place:
-    """Location of a worker.
-
-    Attributes:
-        process: process id.
-        free: bytes of memory available to it if it were alone, of the GPU or of the machine.
-        gpu: its GPU, "" for none.
-    """
+    """Location of a worker: machine, process, `free` bytes available to it if it were alone, of the GPU or of the machine, and GPU or
+    ""."""
 
     machine: str
     process: int
@@ -33,12 +28,7 @@ class Place:
 
 
 class ViewWorker:
-    """A Ray actor: shares of a problem's views, one or more.
-
-    Args:
-        variant: Mitsuba variant.
-        threads: number of processor threads.
-    """
+    """A Ray actor: shares of a problem's views, one or more."""
 
     def __init__(self, variant: str, threads: int):
         self._variant = prepare_worker(variant, threads)

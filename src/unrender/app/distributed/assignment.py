@@ -16,12 +16,8 @@ from unrender.scene.problem import Problem
 
 
 def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
-    """Return the views of each worker, ascending. The largest remaining view goes to the first worker with the fewest pixels so far.
-
-    Args:
-        pixels: number of pixels of each view, at least one view.
-        workers: number of workers, >= 1; at most one per view is used.
-    """
+    """Return the views of each worker, ascending. The largest remaining view goes to the first worker with the fewest pixels so far. At
+    most one worker per view is used."""
     shares: list[list[int]] = [[] for _ in range(min(workers, len(pixels)))]
     loads = [0] * len(shares)
     for view in sorted(range(len(pixels)), key=lambda index: -pixels[index]):
@@ -32,11 +28,7 @@ def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
 
 
 def total(parts: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the sum of trees in order, in double precision; {} for none, or empty ones.
-
-    Args:
-        parts: trees of equal keys, shapes and types.
-    """
+    """Return the sum of trees of equal keys, shapes and types in order, in double precision; {} for none, or empty ones."""
     sums: dict[str, np.ndarray] = {}
     for part in parts:
         for key, value in part.items():
@@ -54,9 +46,6 @@ def split(problem: Problem, sample: PixelSample, shares: Sequence[Sequence[int]]
     """Return the pixels of each share, in the mini-batch's order; None for a share without pixels.
 
     Padding has weight 0, and the random numbers of the mini-batch's first pixel.
-
-    Args:
-        problem: the full problem.
     """
     views, pixels = (arrays.numpy(x).astype(np.uint32) for x in (sample.views, sample.pixels))
     weights = arrays.numpy(sample.weights).reshape(-1)
@@ -98,12 +87,7 @@ _FLOAT = 4
 
 
 def needed(problem: Problem, views: Sequence[int], has_memory: bool) -> tuple[dict[str, int], int]:
-    """Return the bytes of a worker's memory for each parameter, and for these views.
-
-    Args:
-        problem: the full problem.
-        has_memory: whether the image estimator has memory of views.
-    """
+    """Return the bytes of a worker's memory for each parameter, and for these views, with those of an image estimator that `has_memory`."""
     parameters = {key: _COPIES * _FLOAT * math.prod(shape) for key, shape in problem.shapes().items()}
     resolutions = problem.renderer.resolutions()
     pixels = sum(math.prod(resolutions[problem.views[view].sensor]) for view in views)
@@ -111,13 +95,7 @@ def needed(problem: Problem, views: Sequence[int], has_memory: bool) -> tuple[di
 
 
 def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tuple[str, int]], has_memory: bool) -> None:
-    """Raise `InputError` if a share does not fit, stating its size and what would fit.
-
-    Args:
-        problem: the full problem.
-        free: machine of each share, and its available bytes; 0 for unknown.
-        has_memory: see `needed`.
-    """
+    """Raise `InputError` if a share does not fit its (machine, bytes available, 0 for unknown), stating its size and what would fit."""
     for views, (where, room) in zip(shares, free, strict=True):
         parameters, images = needed(problem, views, has_memory)
         if not room or sum(parameters.values()) + images <= room:

@@ -57,12 +57,7 @@ class Traffic:
 
 
 class DistributedExecutor:
-    """An `Executor` whose worker processes hold shares of the views; it sums their gradients in the order of the shares.
-
-    Args:
-        problem: the full problem.
-        variant: see `Executor.variant`.
-    """
+    """An `Executor` whose worker processes hold shares of the views; it sums their gradients in the order of the shares."""
 
     def __init__(
         self,

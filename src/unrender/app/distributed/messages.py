@@ -27,14 +27,8 @@ class Pair:
 
 @dataclass(frozen=True)
 class ImageState:
-    """State of an image estimator with memory of its views.
-
-    Attributes:
-        parameters: parameters of the last step that rendered full views; None before the first.
-        memory: number of the memory of the views; None before the first step.
-        snapshot: whether it is prepared for pixel mini-batches.
-        step: as in `RecursiveControlVariateState`.
-    """
+    """State of an image estimator with memory of its views: parameters of the last step of full views, number of that memory, whether it is
+    prepared for pixel mini-batches, and the step of `RecursiveControlVariateState`."""
 
     parameters: References | None
     memory: int | None

@@ -33,14 +33,7 @@ _SUCCESSORS = 3
 
 @dataclass(eq=False)
 class _Worker:
-    """An actor.
-
-    Attributes:
-        handle: Ray's actor handle.
-        place: where it runs; None until it is ready.
-        first: reference to its first answer.
-        shares: shares that it holds.
-    """
+    """An actor: Ray's handle, the reference to its first answer, its place or None until it is ready, and the shares that it holds."""
 
     handle: Any
     first: Any
@@ -356,12 +349,7 @@ class RayHosts:
             lag.usual = reply.seconds if lag.usual is None else max(reply.seconds, 0.9 * lag.usual)
 
     def _median_of_others(self, worker: _Worker, ordered: list[float]) -> float | None:
-        """Return the median seconds per step of shares on other workers; None if there are none.
-
-        Args:
-            worker: worker whose shares are excluded.
-            ordered: seconds of all shares, ascending.
-        """
+        """Return the median seconds per step of shares on other workers, from the `ordered` ones of all; None if there are none."""
         others = list(ordered)
         for share in worker.shares:
             del others[bisect.bisect_left(others, self._lags[share].seconds)]

@@ -24,13 +24,10 @@ from unrender.scene.problem import Problem
 
 
 class ViewShare:
-    """Some views of a problem on a worker. It is mutable: it stores numbered arrays and memories until the driver drops them.
+    """Some views of a problem on a worker, which stores numbered arrays and memories until the driver drops them.
 
-    Equal calls with equal arrays and memories give equal replies, independent of the worker.
-
-    Args:
-        problem: problem with these views only.
-        views: their indices in the full problem, which determine their random numbers.
+    Equal calls with equal arrays and memories give equal replies, independent of the worker. The views' indices in the full problem
+    determine their random numbers.
     """
 
     def __init__(self, problem: Problem, views: tuple[int, ...]):

@@ -37,12 +37,7 @@ class _Parts(NamedTuple):
 def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     """Return the serialised problem of these views for `unpacked`. References that were given as files are sent as paths.
 
-    Args:
-        problem: the full problem.
-        views: indices of the views.
-
-    Raises:
-        InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.
+    Raises `InputError` for a loaded scene, or a function or object of this process.
     """
     located_views = [_located(problem.original_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)

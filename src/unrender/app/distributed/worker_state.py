@@ -52,11 +52,7 @@ class Recipe:
         self.steps = self.bytes = 0
 
     def is_long(self, size: int) -> bool:
-        """Return whether the memory should be collected.
-
-        Args:
-            size: bytes of the last collection; 0 before there was one.
-        """
+        """Return whether the memory should be collected; `size` is the bytes of the last collection, 0 before there was one."""
         return self.steps >= _MOST_STEPS or self.bytes >= max(_MOST_BYTES, size)
 
     def chain(self) -> list[Recipe]:
@@ -118,11 +114,7 @@ _RECENT = 4
 
 @dataclass(eq=False)
 class Sent:
-    """An array as workers have it.
-
-    Attributes:
-        value: its value on the host.
-    """
+    """An array as workers have it, with its value on the host."""
 
     number: int
     value: np.ndarray

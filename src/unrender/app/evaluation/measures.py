@@ -175,11 +175,7 @@ def write_pictures(
 ) -> None:
     """Write sheet.png, cropped to the masks, and pictures/ with full pictures, as displayed and black outside the masks.
 
-    Args:
-        folder: an existing folder.
-        images: renderings, linear (H, W, 3).
-        relit: renderings under another light, with one exposure of their own; empty to show differences instead.
-        measures: measures of `images` for the labels; empty if they were not measured.
+    All renderings are linear (H, W, 3). Those under another light have one exposure of their own; without any, differences are shown.
     """
     (folder / FOLDER).mkdir()
     masks = [view.pixel_weights() for view in problem.views]

@@ -62,15 +62,8 @@ def read_light(path: Path) -> np.ndarray:
 
 
 def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray | None = None) -> Any:
-    """Load a scene file, optionally with another light.
-
-    With another light, films become RGB.
-
-    Args:
-        path: a scene file of `export_scene`.
-        light: an environment map (H, W, 3) that replaces all lights except emissive shapes; None for the lights of the scene.
-        to_world: (3, 3) rotation of that map.
-    """
+    """Load a scene file of `export_scene`. An environment map (H, W, 3), rotated by `to_world` (3, 3), replaces all lights except emissive
+    shapes; films then become RGB."""
     if light is None:
         return load(path)
     root = Xml.parse(path).getroot()

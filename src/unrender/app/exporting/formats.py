@@ -92,14 +92,8 @@ MITSUBA = "mitsuba"
 
 @dataclass(frozen=True)
 class Format:
-    """A format and its files.
-
-    Attributes:
-        write: the function from the asset and the folder that writes the files.
-        files: the names in the folder, without those of the formats in `needs`.
-        needs: formats that are written with it.
-        check_installed: the function that raises `InputError` if a package is missing.
-    """
+    """A format: its writer, names of its files, formats that are written with it, and a check that raises `InputError` for a missing
+    package."""
 
     write: Callable[[Asset, Path], None]
     files: tuple[str, ...]

@@ -49,15 +49,10 @@ class Place:
 
 
 class SceneGraph:
-    """A description, and a live scene made from it whose objects identify their plugins.
+    """A description (an XML file, or a dictionary without ready-made objects), and a live scene made from it whose objects identify their
+    plugins.
 
-    Args:
-        description: an XML file, or a dictionary without ready-made objects.
-
-    Attributes:
-        nodes: mutable `mitsuba.parser.SceneNode` objects.
-        names: the original id of each node.
-        live: `mitsuba.SceneParameters` of the live scene.
+    `nodes` are mutable `mitsuba.parser.SceneNode` objects, and `live` is the scene's `mitsuba.SceneParameters`.
     """
 
     def __init__(self, description: Path | Mapping[str, Any]):
@@ -215,15 +210,8 @@ def _children(props: Any) -> dict[str, int]:
 
 
 def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: Path) -> None:
-    """Store `value` at `place` of the description; write maps and meshes to files in `folder`.
-
-    Args:
-        graph: the description; its live scene already has all recovered values.
-        key: key of the parameter, which names its file.
-
-    Raises:
-        InputError: a description cannot hold this parameter.
-    """
+    """Store `value` at `place` of a description whose live scene has it already; write maps and meshes to files in `folder`, named by
+    `key`. Raises `InputError` if a description cannot hold this parameter."""
     node, path = graph.nodes[place.node], place.path
     if isinstance(place.owner, mi.Mesh) and len(path) == 1 and path[0].startswith(_VERTEX):
         _mesh(graph, place, folder)

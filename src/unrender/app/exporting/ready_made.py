@@ -31,12 +31,7 @@ def make(description: Callable[[], Any]) -> tuple[Any, Recorded]:
 
 
 class FilesOnly:
-    """A converter of a scene dictionary, which writes ready-made objects to files.
-
-    Args:
-        folder: parent of the sub-folders of the files.
-        recorded: the descriptions that `make` returns.
-    """
+    """A converter of a scene dictionary, which writes ready-made objects to files in sub-folders; `recorded` are the results of `make`."""
 
     def __init__(self, folder: Path, recorded: Recorded):
         self._folder = folder

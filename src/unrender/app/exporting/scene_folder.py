@@ -314,14 +314,8 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
 def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> dict[str, str]:
     """Load the exported scene, and raise `InputError` if its values are not those of the live scene.
 
-    Args:
-        graph: description whose live scene has the recovered values.
-        path: the XML file.
-        recovered: {key of a parameter: its key in the live scene}.
-        posed: nodes that were moved in the exported scene only.
-
-    Returns:
-        {key in the live scene: key in the exported scene}.
+    `recovered` are {key of a parameter: key in the live scene}, and `posed` the nodes that moved in the exported scene alone. Returns {key
+    in the live scene: key in the exported scene}.
     """
     try:
         written = ObjectGraph(load(path)).parameters()

@@ -16,13 +16,7 @@ MOST_PIXELS = 1 << 21
 
 @dataclass(frozen=True)
 class ImageMetric:
-    """A metric of a picture against its reference.
-
-    Attributes:
-        description: the definition, for readers.
-        larger_is_better: whether larger values are better.
-        compute: the function from (picture, reference, mask or None) to a number, or None where the metric is undefined.
-    """
+    """A metric from (picture, reference, mask or None) to a number, or None where it is undefined."""
 
     name: str
     description: str

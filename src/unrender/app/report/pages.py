@@ -238,14 +238,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class ShapePanel:
-    """Meshes that rotate together.
-
-    Attributes:
-        title, note: text above the meshes.
-        solids: meshes from left to right; empty if they are too large or not finite.
-        picture: data URI of a PNG of all meshes side by side, from the first point of view.
-        width, height: size of the picture.
-    """
+    """Meshes from left to right that rotate together, none if they are too large or not finite; and a PNG of them, as a data URI."""
 
     title: str
     note: str

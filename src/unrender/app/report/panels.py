@@ -44,14 +44,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Panel:
-    """Stacks of pictures, side by side on a wide screen.
-
-    Attributes:
-        note: remark on the exposure or the scale.
-        stacks: pictures from top to bottom, for each stack.
-        first_is_large: whether the first stack is larger than the others.
-        independent: whether pictures of different stacks show different regions.
-    """
+    """Stacks of pictures, side by side on a wide screen. Those of `independent` stacks show different regions."""
 
     title: str
     note: str
@@ -61,15 +54,10 @@ class Panel:
 
 
 def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
-    """Return the panel of a view of one run.
+    """Return the panel of a view of one run, whose result is called "Current" while it continues.
 
     It compares the result with the reference and shows the start, the errors, and the maps of the method (control weight, pixel
     probability).
-
-    Args:
-        view: index of the view.
-        shown: pictures of the view.
-        name: name of the result, "Current" while the run continues.
     """
     factor = metrics.exposure(shown.reference, shown.mask)
     what = name.lower()

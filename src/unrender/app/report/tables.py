@@ -123,13 +123,7 @@ class ParameterRow:
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One line of the table of views.
-
-    Attributes:
-        view: its index.
-        before, after: root mean square errors over pixels and channels, at the start and of the result.
-        measures: {name: value} of the result, by the other measures; empty beyond the first views.
-    """
+    """One line of the table of views: errors (RMSE) at the start and of the result; its other measures, {} beyond the first views."""
 
     view: int
     before: float | None

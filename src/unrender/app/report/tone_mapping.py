@@ -23,14 +23,8 @@ VALUE_COLORMAP = "viridis"
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture within the page.
-
-    Attributes:
-        source: a data URI, or the address from which the picture is served.
-        width, height: size of the array in pixels.
-        alt: description in words.
-        linear: whether the picture shows linear colours, whose exposure can be changed.
-    """
+    """A picture within the page: data URI or address, size of the array, description, and whether its colours are linear, with an
+    exposure."""
 
     source: str
     width: int
@@ -63,12 +57,7 @@ class PictureData:
     root: bool = False
 
     def png(self, exposure: float = 1.0, effort: int = 9) -> bytes:
-        """Encode the picture as a PNG file.
-
-        Args:
-            exposure: a further factor of linear RGB; it does not apply to numbers.
-            effort: level of compression, 0 to 9.
-        """
+        """Encode as PNG by 0 to 9 of effort. `exposure` is a further factor of linear RGB, not of numbers."""
         shown = reduced(self.values, _LARGEST)
         if self.map:
             shown = np.sqrt(np.maximum(shown, 0.0)) if self.root else shown
@@ -87,11 +76,7 @@ def inline(picture: PictureData) -> str:
 
 @dataclass(frozen=True)
 class PictureEncoder:
-    """An encoder of pictures for a page.
-
-    Attributes:
-        source: the function from a picture to the `src` of its `img` element: the data itself (`inline`), or the address of the picture.
-    """
+    """An encoder of pictures for a page; `source` returns the `src` of the `img` element: the data itself (`inline`), or its address."""
 
     source: Callable[[PictureData], str] = field(default=inline)
 

@@ -232,12 +232,7 @@ def initial_errors(problem: Problem) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Started:
-    """A trial to start.
-
-    Attributes:
-        number: index of the trial, from 0.
-        settings: {option: value as text}.
-    """
+    """A trial to start: its index, and {option: value as text}."""
 
     number: int
     settings: dict[str, str]

@@ -109,15 +109,8 @@ _PAGE = """<!doctype html>
 
 
 class Redirect:
-    """A file that redirects a browser to an address, in a folder of its own. Only the owner can read either. The context manager
-    removes both.
-
-    Args:
-        url: the target address.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """A file that redirects a browser to `url`, in a folder of its own. Only the owner can read either. The context manager removes both.
+    Raises `OSError` if it cannot be written."""
 
     def __init__(self, url: str):
         self._folder = Path(tempfile.mkdtemp(prefix="unrender-watch-"))  # mode 0700

@@ -35,14 +35,7 @@ _STATES = {
 
 @dataclass(frozen=True)
 class RunRow:
-    """The row of a watched run.
-
-    Attributes:
-        number: its index, from 0.
-        label, state, state_text: its name, its state (see `monitor`), and the description of its state.
-        step, seconds, samples, loss, error: its progress.
-        accepts_commands, paused: whether its buttons are shown, and whether it is paused.
-    """
+    """The row of a watched run: its label, its state (see `monitor`) and that in words, its progress, and the buttons that it has."""
 
     number: int
     label: str
@@ -101,13 +94,9 @@ class PictureCache:
 
 
 def render(template: str, snapshots: Sequence[Snapshot], pictures: PictureCache, chosen: int = 0, view: int = 0) -> str:
-    """Render the page, or its part that changes, as HTML. All text that comes from the runs is escaped.
+    """Render the page, or "watch_main.html", its part that changes. All text that comes from the runs is escaped.
 
-    Args:
-        template: "watch.html", or "watch_main.html" for the part that changes.
-        snapshots: the runs, at least one.
-        pictures: the cache that receives the pictures.
-        chosen, view: indices of the run and of the view whose pictures are shown; the first one for an index out of range.
+    `chosen` and `view` are indices of the run and of the view whose pictures are shown; the first one for an index out of range.
     """
     pictures.start_page()
     labels = _labels([snapshot.path for snapshot in snapshots])

@@ -37,14 +37,7 @@ FINISHED, LOST, VANISHED = "finished", "lost", "vanished"
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The known state of a run.
-
-    Attributes:
-        state: one of the states above.
-        run: the data that could be read; None without any.
-        status: status of a live run; None otherwise.
-        problems: data that could not be read, one line each.
-    """
+    """The known state of a run. `run` is None where no data could be read, and `problems` has a line for data that could not."""
 
     path: Path
     state: str
@@ -59,11 +52,7 @@ class Snapshot:
 
 
 class RunMonitor:
-    """A monitor of a run folder. Its content is untrusted, and every file may be missing.
-
-    Attributes:
-        revision: number of changes so far.
-    """
+    """A monitor of a run folder, with the number of changes so far. Its content is untrusted, and every file may be missing."""
 
     def __init__(self, path: Path):
         self.path = path

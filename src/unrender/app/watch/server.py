@@ -52,12 +52,7 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Address:
-    """The address of the page.
-
-    Attributes:
-        port: port on 127.0.0.1.
-        token: the secret that every path begins with.
-    """
+    """The address of the page: port on 127.0.0.1, and the secret that every path begins with."""
 
     port: int
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
@@ -84,13 +79,7 @@ def listen(port: int) -> socket.socket:
 def serve(
     directories: Sequence[Path], address: Address, on: socket.socket, on_admission: Callable[[], object] | None = None
 ) -> None:
-    """Serve the page of these run folders until Ctrl-C.
-
-    Args:
-        directories: run folders.
-        on: a socket of `listen`.
-        on_admission: called once, at the first request that shows the token.
-    """
+    """Serve the page of these run folders on a socket of `listen` until Ctrl-C; call `on_admission` at the first request with the token."""
     connections.enough_files()
     uvicorn.Server(_config(application(directories, address, _REFUSAL_SECONDS, on_admission))).run(sockets=[on])
 
@@ -116,13 +105,8 @@ def application(
     refusal_seconds: float = 0.0,
     on_admission: Callable[[], object] | None = None,
 ) -> ASGIApp:
-    """Return the page as an ASGI application. Requests without the token are answered with 403.
-
-    Args:
-        directories: run folders.
-        refusal_seconds: delay of a 403, so that repeated requests take no time from the runs.
-        on_admission: as for `serve`.
-    """
+    """Return the page as an ASGI application. Requests without the token are answered with 403, after a delay so that repeated ones take no
+    time from the runs. `on_admission`: see `serve`."""
     page = _Page(directories)
     routes = [
         Route("/", page.full),

@@ -66,15 +66,10 @@ def is_lit(folder: Path, kind: str | None) -> bool:
 
 
 def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Capture:
-    """Read the capture in a folder.
+    """Read the capture in a folder; of the first format whose files exist if `kind` is None.
 
-    Args:
-        folder: folder of the capture.
-        kind: a key of `FORMATS`; None for the first whose files exist.
-        masks: a folder of masks named like the photographs; None for masks that the format names or that are next to the photographs.
-
-    Raises:
-        InputError: the folder does not exist, has none of the formats, or contains unreadable files.
+    `masks` is a folder of masks named like the photographs; None for masks that the format names or that are next to the photographs.
+    Raises `InputError` if the folder does not exist, has none of the formats, or contains unreadable files.
     """
     for place, name in ((folder, "FOLDER"), (masks, "--masks")):
         if place is not None and bounded_files.kind(place) != "folder":

@@ -26,13 +26,8 @@ _FEWEST = 4
 
 @dataclass(frozen=True)
 class LitCapture:
-    """Photographs of one camera under one light each.
-
-    Attributes:
-        photographs: files, at least four.
-        directions: (N, 3) unit, towards the lights: x right, y up, z towards the camera.
-        mask: a file, white on the object, or None.
-    """
+    """At least four photographs of one camera, under one light each, with unit directions (N, 3) towards the lights: x right, y up, z
+    towards the camera."""
 
     folder: Path
     photographs: tuple[Path, ...]

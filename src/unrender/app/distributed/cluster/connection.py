@@ -45,13 +45,8 @@ def reach(address: str, seconds: float) -> None:
 
 
 class HeadNode:
-    """Monitor of the head node. Workers continue for some time without it, but nothing can be started or found.
-
-    Args:
-        address: HOST:PORT; "" for none, which is never lost.
-        clock: function that returns seconds.
-        reach: function that connects to the address.
-    """
+    """Monitor of the head node at HOST:PORT; one at "" is never lost. Workers continue for some time without it, but nothing can be started
+    or found."""
 
     def __init__(
         self,
@@ -156,13 +151,7 @@ _NAMESPACE = "unrender"
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connected Ray cluster.
-
-    Attributes:
-        variant: variant of the workers, for `prepare_worker`.
-        share: number of workers, and resources of each.
-        address: address of the cluster; None for a local one.
-    """
+    """A connected Ray cluster, with the variant and the share of its workers, and its address; None for a local one."""
 
     ray: Any
     variant: str

@@ -39,16 +39,11 @@ _ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_E
 
 @contextlib.contextmanager
 def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
-    """Prepare the start of a cluster that only this user's processes can enter.
+    """Prepare the start of a cluster that only this user's processes can enter. Yield the arguments of `ray.init`.
 
     The token is in the environment of these processes, which other users cannot read, and is never written. All services listen on the
-    loopback interface. Ray's files are below a folder of mode 0700.
-
-    Yields:
-        Arguments of `ray.init`.
-
-    Raises:
-        InputError: no folder is safe, or this version of Ray does not support tokens.
+    loopback interface. Ray's files are below a folder of mode 0700. Raises `InputError` if no folder is safe, or this version of Ray does
+    not support tokens.
     """
     _clear_token_cache(ray)  # raises before any changes
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
@@ -75,10 +70,7 @@ def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
 
 
 def check_private(ray: Any) -> None:
-    """Check that a cluster that was just started listens on the loopback interface alone, and asks for the token.
-
-    Raises `InputError` if it does not.
-    """
+    """Raise `InputError` unless a cluster that was just started listens on the loopback interface alone, and asks for the token."""
     address = ray.get_runtime_context().gcs_address
     asks = ray._raylet.get_authentication_mode() == ray._raylet.AuthenticationMode.TOKEN
     if not address.startswith(("127.", "[::1]")) or not asks:
@@ -181,10 +173,7 @@ def has_token() -> bool:
 
 
 def check_token(address: str) -> None:
-    """Check that the cluster requires a token, and that other users cannot read it.
-
-    Raises `InputError` if anyone who can reach the cluster could run programs as this user.
-    """
+    """Raise `InputError` unless the cluster requires a token that other users cannot read: they could run programs as this user."""
     mode = os.environ.get("RAY_AUTH_MODE", "disabled").lower()
     if mode == "disabled" or (mode == "token" and not has_token()):
         raise InputError(
@@ -199,10 +188,8 @@ def check_token(address: str) -> None:
 
 
 def check_cluster(ray: Any, address: str) -> None:
-    """Check that other users of this machine cannot change the folders of the cluster's nodes here.
-
-    Raises `InputError` if they can, or the cluster refuses the connection.
-    """
+    """Raise `InputError` if other users of this machine can change the folders of the cluster's nodes here, or it refuses the
+    connection."""
     for folder in sorted({node.session_dir for node in _nodes(ray, address)}):
         if folder and os.path.isdir(folder) and (reason := can_change(Path(folder))):
             raise InputError(

@@ -19,13 +19,8 @@ _GRACE_SECONDS = 4.0
 
 @dataclass(frozen=True)
 class Ended:
-    """A completed task.
-
-    Attributes:
-        value: result of its function; None if it failed.
-        message: reason of the failure, one line; "" on success.
-        attempts: number of starts.
-    """
+    """A completed task: the value of its function, None if it failed, the reason of the failure in one line or "", and the number of
+    starts."""
 
     key: Any
     value: Any
@@ -60,11 +55,7 @@ class Executor(Protocol):
 
 @dataclass
 class InProcess:
-    """Executor that runs one task at a time in this process, in `wait`.
-
-    Attributes:
-        function: function of the arguments of `start`.
-    """
+    """Executor that runs one task at a time in this process, in `wait`."""
 
     function: Callable[..., Any]
     slots: int = 1
@@ -98,13 +89,9 @@ class _Begun:
 
 
 class OnWorkers:
-    """Executor that runs tasks on a cluster's workers, each in its own process.
+    """Executor that runs an importable function on a cluster's workers, each task in its own process.
 
     If the process or its machine dies, the task is restarted, at most twice.
-
-    Args:
-        cluster: connected cluster.
-        function: importable function with serialisable arguments and result.
     """
 
     def __init__(self, cluster: Cluster, function: Callable[..., Any]):

@@ -13,18 +13,8 @@ _prepared: list[tuple[str, int]] = []
 
 
 def prepare_worker(name: str, threads: int) -> str:
-    """Choose the variant and the number of threads, once per process. Later calls with the same arguments do nothing.
-
-    Args:
-        name: name of the variant, or "auto".
-        threads: processor threads, >= 1.
-
-    Returns:
-        The active variant.
-
-    Raises:
-        VariantError: this machine does not support it.
-    """
+    """Choose the variant and the number of threads, once per process, and return the variant. Later calls with the same arguments do
+    nothing. Raises `VariantError` if this machine does not support it."""
     chosen = variant.use(name)
     if (name, threads) not in _prepared:
         variant.use_threads(threads)
@@ -75,13 +65,7 @@ class Workers:
 
 @dataclass(frozen=True)
 class Share:
-    """Number of workers, and resources of each.
-
-    Attributes:
-        count: number of workers, >= 1.
-        cpus: cores per worker: an integer, or 1/k if k workers share one.
-        gpus: GPUs per worker: 0, 1, or 1/k.
-    """
+    """Number of workers, and resources of each: `cpus` is an integer, or 1/k if k workers share a core; `gpus` is 0, 1, or 1/k."""
 
     count: int
     cpus: float
@@ -121,11 +105,7 @@ def share(machines: Sequence[tuple[float, float]], count: int | None, gpu: bool,
 
 
 def most_by_memory(most: int | None) -> int | None:
-    """Return the maximum number of workers for the free memory of this machine or container, 512 MiB each.
-
-    Args:
-        most: maximum useful number of workers; None for no maximum. It is returned unchanged if the memory is unknown.
-    """
+    """Return the maximum number of workers for the free memory of this machine or container, 512 MiB each; `most` if that is unknown."""
     free = limits.free_memory()
     if not free:
         return most
