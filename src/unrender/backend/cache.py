@@ -142,12 +142,8 @@ _OVERFLOW = Path("/proc/sys/kernel/overflowuid")
 
 
 def can_change(folder: Path, shared: bool = False) -> str:
-    """Return how other users could change entries of a folder or replace it, as a phrase for a message; "" if they cannot.
-
-    Args:
-        folder: existing folder.
-        shared: whether others may add entries, as in the system's temporary folder, whose sticky bit must be set.
-    """
+    """Return how other users could change entries of a folder or replace it, as a phrase for a message; "" if they cannot. In a `shared`
+    one, as the system's temporary folder, others may add entries, and the sticky bit must be set."""
     place = Path(os.path.realpath(folder))
     for above in (place, *place.parents):
         if _shielded(above.parent):  # the shielding folder itself may still be replaced, so its parents are checked too

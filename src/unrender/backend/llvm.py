@@ -36,11 +36,7 @@ _VERSION_IN_FOLDER = re.compile(r"/llvm[@-]?(\d+)/|/Cellar/llvm/(\d+)\.")
 
 @dataclass(frozen=True)
 class Library:
-    """An installed LLVM library.
-
-    Attributes:
-        major: major version, or None if neither the file's name nor the library reports it.
-    """
+    """An installed LLVM library; its major version is None if neither the file's name nor the library reports it."""
 
     path: Path
     major: int | None

@@ -197,11 +197,8 @@ def check_threads(count: int) -> None:
 
 
 def use_threads(count: int) -> None:
-    """Set the number of Dr.Jit's CPU threads, >= 1. Call it before the first kernel of the process; later, Dr.Jit may crash.
-
-    Raises:
-        InputError: more than four threads per core.
-    """
+    """Set the number of Dr.Jit's CPU threads, >= 1, before the first kernel of the process; later, Dr.Jit may crash. Raises `InputError`
+    for more than four per core."""
     check_threads(count)
     ensure()
     import drjit as dr

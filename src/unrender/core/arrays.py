@@ -208,13 +208,8 @@ def add_rows(x: Array, index: Array, count: int) -> Array:
 
 
 def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
-    """Return the sums of consecutive rows of `x` (N, C) for P segments, (P, C). The order of summation is fixed.
-
-    Args:
-        x: rows (N, C); each row is in exactly one segment.
-        starts: index of the first row of each segment, (P,), ascending integers.
-        numbers: number of rows of each segment, (P,), >= 1.
-    """
+    """Return the sums of consecutive rows of `x` (N, C) for P segments, (P, C), by their first rows, ascending, and numbers of rows, >= 1.
+    The order of summation is fixed."""
     if not is_drjit(x):
         return np.add.reduceat(x, starts, axis=0)
     width, kind, values = x.shape[1], type(starts), x.array

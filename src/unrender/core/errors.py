@@ -22,12 +22,7 @@ class InputError(UnrenderError, ValueError):
 
 
 class KeyedError(InputError):
-    """Invalid input about one key.
-
-    Args:
-        key: The key.
-        what: One line without the key.
-    """
+    """Invalid input about one key; `what` is one line without it."""
 
     def __init__(self, key: str, what: str):
         super().__init__(what)

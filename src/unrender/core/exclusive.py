@@ -13,13 +13,8 @@ from unrender.core.errors import InputError
 
 @dataclass
 class _Turn:
-    """Owner of the lock.
-
-    Attributes:
-        changed: condition that is notified when the lock is released.
-        thread: thread that holds the lock, or None.
-        doing: stack of the calls in that thread, the innermost last: (function name, whether it may take long).
-    """
+    """Owner of the lock: its thread or None, a condition that is notified of its release, and the stack of its calls, (name, whether it may
+    take long)."""
 
     changed: threading.Condition = field(default_factory=threading.Condition)
     thread: threading.Thread | None = None
@@ -42,11 +37,8 @@ if hasattr(os, "register_at_fork"):
 def exclusive(what: str, long: bool = False) -> Iterator[None]:
     """Serialise calls from different threads, as a decorator or in a `with` statement. Calls within one thread may nest.
 
-    A call waits for the other thread's call to end. It raises `InputError` instead if the other call is marked `long`.
-
-    Args:
-        what: name of the function in the message.
-        long: whether the function may take hours, as a run does.
+    A call waits for the other thread's call to end. It raises `InputError` instead if the other call is marked `long`: it may take hours,
+    as a run does.
     """
     me = threading.current_thread()
     with _turn.changed:

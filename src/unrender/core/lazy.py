@@ -8,12 +8,7 @@ from typing import Any
 
 
 def attach(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], list[str]]:
-    """Return the `__getattr__` and the `__all__` of a package with lazy imports.
-
-    Args:
-        package: dotted name of the package.
-        homes: {public name: module below the package that defines it}.
-    """
+    """Return the `__getattr__` and the `__all__` of a package with lazy imports from {public name: module below the package}."""
 
     def get(name: str) -> Any:
         if name not in homes:

@@ -15,12 +15,7 @@ from unrender.core.arrays import Array
 
 
 def interior_shape(shape: tuple[int, ...], columns: int) -> tuple[int, ...]:
-    """Return the shape of the array without its repeated columns.
-
-    Args:
-        shape: (H, W + 2 `columns`, ...).
-        columns: number of repeated columns at each end.
-    """
+    """Return the shape of an array (H, W + 2 `columns`, ...) without its repeated columns."""
     return shape if not columns else (shape[0], shape[1] - 2 * columns, *shape[2:])
 
 
@@ -35,12 +30,7 @@ def pad(x: np.ndarray, columns: int) -> np.ndarray:
 
 
 def repeat(x: Array, columns: int) -> Array:
-    """Overwrite the outer columns with copies of the columns that they repeat.
-
-    Args:
-        x: (H, W + 2 `columns`, C), NumPy or Dr.Jit.
-        columns: number of repeated columns at each end; 0 returns `x` itself.
-    """
+    """Overwrite the outer columns of an array (H, W + 2 `columns`, C) with copies of the columns that they repeat."""
     if not columns:
         return x
     shape = arrays.shape(x)

@@ -68,11 +68,8 @@ def phase(name: str) -> Iterator[Callable[[float], None]]:
 
 
 class Stopwatch(Listener):
-    """Listener that sums the seconds of each phase. Time in a nested phase counts for the nested phase only.
-
-    Attributes:
-        seconds: {name: seconds}, in the order in which the phases first started.
-    """
+    """Listener that sums the seconds of each phase, in the order of their first starts. Time in a nested phase counts for the nested phase
+    only."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -87,14 +87,7 @@ KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True)
 class Component:
-    """A registered class.
-
-    Attributes:
-        name: registered name.
-        kind: key of `KINDS`.
-        made_by: the class.
-        position: sort key in lists; components without one follow, by name.
-    """
+    """A registered class, its kind, a key of `KINDS`, and its place in lists; components without one follow, by name."""
 
     name: str
     kind: str

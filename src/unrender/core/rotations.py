@@ -12,12 +12,8 @@ MITSUBA_TO_OPENGL.setflags(write=False)
 
 
 def rotation(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of column vectors, counterclockwise seen from the axis's tip (Rodrigues' formula).
-
-    Args:
-        axis: (3,) unit.
-        angle: radians.
-    """
+    """Return the rotation matrix (3, 3) of column vectors, counterclockwise by radians seen from the tip of a unit axis (Rodrigues'
+    formula)."""
     x, y, z = np.asarray(axis, float)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     cosine, sine = np.cos(angle), np.sin(angle)

@@ -110,14 +110,10 @@ _SYNONYMS = {
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
-    """Return "; did you mean X?" with the nearest known name, or "" if none is similar.
+    """Return "; did you mean X?" with the nearest known name, or "" if none has the `difflib` similarity `likeness`.
 
-    A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate).
-
-    Args:
-        name: the misspelt name.
-        known: the valid names. Only the first 1000 are compared, and only those of at most 200 characters.
-        likeness: smallest similarity (`difflib`), from 0 for any name to 1 for an equal name.
+    A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate). Only the first 1000
+    names of at most 200 characters are compared.
     """
     if len(name) > _LONGEST:
         return ""

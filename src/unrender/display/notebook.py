@@ -141,13 +141,7 @@ class NotebookBar(phases.Listener):
         self._within.pop()
 
     def show(self, text: str, share: float | None, at_once: bool = False) -> None:
-        """Replace the line of text and the bar, at most five times per second.
-
-        Args:
-            text: description of the activity.
-            share: progress in [0, 1]; None if unknown.
-            at_once: whether to ignore the time limit.
-        """
+        """Replace the line of text and the bar, a share in [0, 1] or None, at most five times per second unless `at_once`."""
         now = time.perf_counter()
         if not at_once and now - self._updated < _INTERVAL:
             return

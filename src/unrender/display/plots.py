@@ -22,13 +22,7 @@ _SMALLEST, _LARGEST = 1e-280, 1e280
 
 @dataclass(frozen=True)
 class Line:
-    """A curve; x is ascending, and all arrays have the same length.
-
-    Attributes:
-        x, y: points of the curve.
-        low, high: limits of the band around it, or None.
-        colour: index into the page's colours, from 0.
-    """
+    """A curve; x is ascending, and all arrays have the same length. `low` and `high` limit the band around it."""
 
     name: str
     x: np.ndarray
@@ -40,12 +34,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """A map from values to [0, 1], linear or logarithmic.
-
-    Attributes:
-        low, high: values at 0 and 1; positive if logarithmic.
-        ticks: (value, label).
-    """
+    """A map from values to [0, 1], linear or logarithmic, with ticks (value, label); `low` and `high` are the values at 0 and 1."""
 
     low: float
     high: float
@@ -62,12 +51,8 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in the chart's coordinates.
-
-    Attributes:
-        path, band: attribute `d` of the SVG paths of the line and of its band; "" for no band.
-        colour: index into the page's colours, from 0 to 5.
-    """
+    """A line in the chart's coordinates: `d` of the SVG paths of the line and of its band, "" for none; index of its colour, from 0 to
+    5."""
 
     name: str
     path: str
@@ -104,13 +89,8 @@ class Chart:
 
 
 def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
-    """Return a chart of the first six lines with a finite value; None without one.
-
-    Args:
-        title: label of the vertical axis.
-        lines: curves; values that are not finite leave a gap.
-        axis: horizontal axis, "seconds" or "samples", from 0.
-    """
+    """Return a chart over "seconds" or "samples" of the first six lines with a finite value; None without one. Values that are not finite
+    leave a gap."""
     in_seconds = axis == "seconds"
     x_label, format_value = ("Seconds", formatting.number) if in_seconds else ("Samples (paths)", formatting.count)
     shown = [line for line in lines if np.isfinite(line.y).any()]

@@ -67,11 +67,8 @@ def exists(path: Path) -> bool:
 
 
 def kind(path: Path) -> str:
-    """Return the kind of `path`, links followed: "file", "folder", "other" (a pipe, a socket, a device), or "" if it does not exist.
-
-    Raises:
-        InputError: the name is too long, or a parent folder cannot be entered.
-    """
+    """Return the kind of `path`, links followed: "file", "folder", "other" (a pipe, a socket, a device), or "" if it does not exist. Raises
+    `InputError` if the name is too long, or a parent folder cannot be entered."""
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a name with a zero byte
@@ -102,14 +99,8 @@ def no_file(path: Path) -> str:
 
 
 def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
-    """Open a regular file, links followed.
-
-    Args:
-        folder: folder that must contain it; None for any.
-
-    Raises:
-        InputError: it is missing, is outside of `folder` (by a link), or is not a regular file (reading a pipe would block).
-    """
+    """Open a regular file, links followed. Raises `InputError` if it is missing, outside of `folder` (None for any), or not a regular file,
+    whose reading may block."""
     try:
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(folder.resolve(strict=True)):

@@ -53,10 +53,7 @@ def is_confined() -> bool:
 def check(path: Path, folders: Sequence[Path], what: str) -> None:
     """Raise `InputError` if a file, links resolved, is outside of all `folders` and those of `within`.
 
-    Args:
-        path: path of the file, as it will be opened.
-        folders: allowed folders; the message names the first.
-        what: beginning of the message: the input, and how it refers to the file.
+    Its message begins with `what`, the input and how it refers to the file, and names the first folder.
     """
     if is_outside_allowed():
         return

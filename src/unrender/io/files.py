@@ -209,17 +209,10 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def check_replaceable(place: Path, own: Collection[str], record: str, overwrite: bool, label: str, what: str) -> None:
-    """Raise `InputError` if `write_folder` would replace a folder that contains other files.
+    """Raise `InputError` if `write_folder` would replace a folder that has other files than its `own`, or lacks `record`, or if not
+    `overwrite`.
 
-    Leftovers of a process that died while writing it are removed first.
-
-    Args:
-        place: path of the folder, which need not exist.
-        own: names that such a folder may contain.
-        record: the one of `own` that identifies such a folder.
-        overwrite: whether an existing one may be replaced.
-        label: beginning of the message, e.g. "--out judge".
-        what: description of such a folder, e.g. "an earlier judgement".
+    Leftovers of a process that died while writing it are removed first. Messages begin with `label` and call such a folder `what`.
     """
     remove_leftovers(place.parent, (place.name,))
     with input_errors(label):
@@ -233,14 +226,10 @@ def check_replaceable(place: Path, own: Collection[str], record: str, overwrite:
 
 
 def write_folder(place: Path, fill: Callable[[Path], _T], label: str) -> _T:
-    """Create or replace the folder `place` as `replace_folder` does. If filling it fails, nothing is left behind.
+    """Create or replace the folder `place` as `replace_folder` does, and return the result of `fill`. If that fails, nothing is left
+    behind.
 
-    Args:
-        place: path of the folder; its parents are created.
-        fill: function that writes the contents into an empty folder.
-        label: beginning of the message of an error, e.g. "export to out/room".
-
-    Returns the result of `fill`. Raises `InputError` if the folder cannot be written, and whatever `fill` raises.
+    Raises `InputError`, beginning with `label`, if the folder cannot be written, and whatever `fill` raises.
     """
     partial = place.with_name(f".{place.name}.{os.getpid()}.{PARTIAL}")
     try:
@@ -254,13 +243,9 @@ def write_folder(place: Path, fill: Callable[[Path], _T], label: str) -> _T:
 
 
 def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None:
-    """Remove what processes that died left half-written or half-removed in a folder; subfolders are not searched.
+    """Remove what dead processes left half-written or half-removed in a folder, under these `names` or any; subfolders are not searched.
 
     A folder that was moved away for a replacement that did not happen is restored. Files of other live processes are not touched.
-
-    Args:
-        folder: path of the folder; nothing happens if it does not exist or is a link.
-        names: final names of the files to consider; None for all.
     """
     if folder.is_symlink():
         return

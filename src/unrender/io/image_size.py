@@ -38,14 +38,8 @@ _FARTHEST = 1 << 30
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a picture file.
-
-    Attributes:
-        kind: "PNG", "TIFF" and so on.
-        sizes: width, height and channels of each part.
-        bits: bits per channel of a PNG or TIFF file; 0 for other kinds.
-        orientation: orientation tag of a TIFF file; 1 for other kinds.
-    """
+    """Header of a picture file: its kind, such as "PNG", and width, height and channels of each part. Others than PNG and TIFF have 0 bits
+    per channel and the orientation 1."""
 
     kind: str
     sizes: Sizes
@@ -225,12 +219,8 @@ def _check_scanlines(data: bytes, width: int, height: int) -> None:
 
 
 def _netpbm(pattern: bytes, coloured: bytes) -> _Reader:
-    """Return the reader of a text header.
-
-    Args:
-        pattern: its groups are the type, width, height and, if Mitsuba decodes the file, the largest value.
-        coloured: types of three channels.
-    """
+    """Return the reader of a text header: type, width, height and, if Mitsuba decodes it, the largest value; `coloured` types have three
+    channels."""
 
     def read(data: bytes, _: IO[bytes]) -> Sizes:
         if (match := re.match(pattern, data)) is None:

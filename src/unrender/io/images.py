@@ -142,12 +142,8 @@ def write(picture: Any, path: Path, half: bool = False) -> None:
 
 
 def resize(values: np.ndarray, height: int, width: int, around: bool = False) -> np.ndarray:
-    """Resize an image (H, W, C) to (height, width, C), with smoothing before reduction and linear interpolation for enlargement.
-
-    Args:
-        values: the image.
-        around: whether the left and right borders are neighbours, as in an environment map.
-    """
+    """Resize an image (H, W, C) to (height, width, C), with smoothing before reduction and linear interpolation for enlargement; `around`
+    an environment map, whose left and right borders are neighbours."""
     if values.shape[:2] == (height, width):
         return values
     if around:

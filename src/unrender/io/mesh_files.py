@@ -70,11 +70,8 @@ class _Header:
 
 
 def check_ply(path: Path, splats: bool = False) -> None:
-    """Raise `InputError` unless a PLY file has the rows that it declares, and triangles of existing vertices.
-
-    Args:
-        splats: whether it contains ellipsoids, whose properties must be float32 and in Mitsuba's order.
-    """
+    """Raise `InputError` unless a PLY file has the rows that it declares, and triangles of existing vertices or, as `splats`, ellipsoids,
+    whose properties must be float32 and in Mitsuba's order."""
     with bounded_files.open_regular(path) as file:
         header = _header(file, path)
         vertices = [each for each in header.elements if each.name == "vertex"]

@@ -28,24 +28,13 @@ _LARGEST_ASSET = 1 << 32
 
 @dataclass
 class AssetChecks:
-    """Checks of the files of one scene.
-
-    Attributes:
-        values: number of values of the images and grids so far.
-    """
+    """Checks of the files of one scene, and the number of values of its images and grids so far."""
 
     values: int = 0
 
     def check(self, plugin: str, path: Path, index: int = 0) -> None:
-        """Check a file that an object refers to, and add its values to `values`.
-
-        Args:
-            plugin: type of the object.
-            index: `shape_index` of the object.
-
-        Raises:
-            InputError: one line that names the file.
-        """
+        """Check a file that an object of type `plugin` refers to, with its `shape_index`, and add its values to `values`. Raises
+        `InputError`."""
         if (kind := bounded_files.kind(path)) != "file":
             raise InputError(f"{shorten(str(path), 200)}: {_KINDS_OF_PATHS[kind]}")
         if plugin == "serialized":
@@ -199,12 +188,7 @@ class _Reader:
     _bytes: int = 0
 
     def read(self, path: Path, shown: str, search: list[Path], depth: int) -> None:
-        """Read an XML file and its includes.
-
-        Args:
-            search: folders that Mitsuba will search for its files; its `path` elements are added.
-            depth: nesting depth of the include.
-        """
+        """Read an XML file at a nesting `depth`, and its includes. Its `path` elements are added to the folders of `search`."""
         if len(self.xml) >= _MOST_INCLUDES:
             raise InputError(f"scene {shown}: more than {_MOST_INCLUDES} includes")
         if depth > _DEEPEST_INCLUDE:

@@ -59,11 +59,7 @@ class PictureStore:
 
 
 class StoredPicture:
-    """An image (H, W, ...) of float32 that is read on request: `np.asarray` reads all of it, `rows` reads some pixels.
-
-    Attributes:
-        shape, dtype, ndim, size, nbytes: those of the array.
-    """
+    """An image (H, W, ...) of float32 that is read on request: `np.asarray` reads all of it, `rows` reads some pixels."""
 
     dtype = np.dtype(np.float32)
 

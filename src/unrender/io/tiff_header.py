@@ -27,13 +27,7 @@ _NO_ROWS = (1 << 32) - 1
 
 @dataclass(frozen=True)
 class TiffHeader:
-    """Header of a file with one image.
-
-    Attributes:
-        size: width, height and channels.
-        bits: bits per channel.
-        orientation: the orientation tag, 1 to 8.
-    """
+    """Header of a file with one image: width, height and channels, bits per channel, and the orientation tag, 1 to 8."""
 
     size: tuple[int, int, int]
     bits: int

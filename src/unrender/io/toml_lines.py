@@ -255,13 +255,7 @@ def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]])
 
 
 class FieldError(InputError):
-    """An invalid field of a problem.
-
-    Args:
-        place: path of the field, e.g. ("parameters", 0, "bounds").
-        what: what is wrong and what was expected, in one line.
-        owner: name of the field in the message, e.g. "parameter wall.data: bounds"; None for the dotted path.
-    """
+    """An invalid field of a problem at `place`, such as ("parameters", 0, "bounds"). `owner` replaces the dotted path in the message."""
 
     def __init__(self, place: Place, what: str, owner: str | None = None):
         super().__init__(f"{owner or dotted(place)}: {what}")

@@ -108,21 +108,11 @@ class Corrections:
 
 
 class PosedCameras(WithParameter):
-    """A renderer with the parameter `poses` (V, 6) for all cameras together, see `Corrections`.
+    """A renderer with the parameter `poses` (V, 6) for all cameras together, a row for each of `sensors`, see `Corrections`.
 
-    Images, batches and gradients are as unbiased as the inner renderer's. `tangent_moment` omits the derivatives by the
-    poses. Two states share random numbers, not paths.
-
-    Args:
-        inner: renderer of the scene; it implements `WithCameras`.
-        sensors: indices of the sensors that have a row, in the order of the rows.
-
-    Attributes:
-        corrections: map between rows and pose parameters.
-        notices: of the inner renderer.
-
-    Raises:
-        InputError: fewer than 3 sensors, a sensor that cannot be moved, or a renderer that does not implement `WithCameras`.
+    Images, batches and gradients are as unbiased as the inner renderer's. `tangent_moment` omits the derivatives by the poses. Two states
+    share random numbers, not paths. Raises `InputError` for fewer than 3 sensors, a sensor that cannot be moved, or a renderer that does
+    not implement `WithCameras`.
     """
 
     key = POSES

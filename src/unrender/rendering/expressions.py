@@ -53,12 +53,8 @@ class Expression:
 
 
 class _Reads(Mapping[str, Any]):
-    """The values of unknowns by name, at least one, and which of them were read.
-
-    Attributes:
-        names: Names that were read, in their order.
-        like: One of the values, not counted as read.
-    """
+    """The values of unknowns by name, at least one, the `names` that were read, in their order, and one of the values that is not counted
+    as read."""
 
     def __init__(self, values: Mapping[str, Any]):
         self._values, self.names = values, dict[str, None]()
@@ -78,17 +74,9 @@ class _Reads(Mapping[str, Any]):
 class ExpressionRenderer(RendererWrapper):
     """A renderer with additional unknowns; some parameters of the scene are functions of these.
 
-    Images and gradients are as unbiased as the inner renderer's: the gradient by an unknown is that by the parameters times the
-    derivatives of the functions.
-
-    Args:
-        inner: Renders the scene with Dr.Jit arrays.
-        expressions: One for each parameter that is a function.
-        unknowns: {name: initial value} of the unknowns that the functions may read.
-
-    Raises:
-        KeyedError: A function reads a name that is no unknown, fails, or its result does not suit the parameter.
-        InputError: No function reads one of the unknowns.
+    Images and gradients are as unbiased as the inner renderer's: the gradient by an unknown is that by the parameters times the derivatives
+    of the functions. Raises `KeyedError` if a function reads a name that is no unknown, fails, or its result does not suit the parameter;
+    `InputError` for an unknown that no function reads.
     """
 
     def __init__(self, inner: Renderer, expressions: Iterable[Expression], unknowns: Mapping[str, np.ndarray]):

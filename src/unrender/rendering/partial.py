@@ -27,11 +27,8 @@ from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 class PartialDerivatives(RendererWrapper):
     """A renderer that sets the derivatives of some parameters to 0.
 
-    These parameters change and need not be differentiable. The gradient by all others is that of the inner renderer at
-    their current values.
-
-    Args:
-        constant: keys of the parameters whose derivatives are 0.
+    These parameters change and need not be differentiable. The gradient by all others is that of the inner renderer at their current
+    values.
     """
 
     def __init__(self, inner: Renderer, constant: frozenset[str]):
@@ -60,11 +57,7 @@ class _PartialSession(SessionWrapper):
 
 
 class HeldParameters(RendererWrapper):
-    """A renderer of the scene with some parameters fixed at constant values.
-
-    Args:
-        held: {key: array} of the fixed parameters. Sessions return no derivatives by them.
-    """
+    """A renderer of the scene with some parameters fixed at constant values. Sessions return no derivatives by them."""
 
     def __init__(self, inner: Renderer, held: Tree):
         super().__init__(inner)

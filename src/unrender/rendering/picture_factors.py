@@ -66,13 +66,7 @@ class PictureRenderer(WithParameter):
 
 @dataclass(frozen=True)
 class PicturePaths:
-    """Data that `adjoint` needs to replay the paths of a rendering.
-
-    Attributes:
-        inner: paths of the inner renderer.
-        images, previous: images of the inner renderer, as in `Rendering`.
-        places: per-pixel data, other than image and parameter, that the parameter's effect depends on; None if there is none.
-    """
+    """Data that `adjoint` needs to replay the paths of a rendering: those of the inner renderer, its images, and other data per pixel."""
 
     inner: object
     images: Array

@@ -24,13 +24,7 @@ _DARK = 2.0**-10
 
 @dataclass(frozen=True)
 class Curve:
-    """Values and derivatives of a response curve, each of the images' shape.
-
-    Attributes:
-        values: f(x).
-        slopes: ∂f/∂x, > 0.
-        by_contrast, by_brightness: ∂f/∂c and ∂f/∂d.
-    """
+    """Values f(x), slopes ∂f/∂x > 0, and ∂f/∂c and ∂f/∂d of a response curve, each of the images' shape."""
 
     values: Array
     slopes: Array

@@ -51,11 +51,7 @@ def turns_of(
 ) -> tuple[Turns, list[int]] | None:
     """Return rotations for which each view is a sensor, and the sensors of the views; None if views differ by more or by nothing.
 
-    Args:
-        renderer: renderer of the scene.
-        count: number of described sensors.
-        worlds: described sensor and known values of each view.
-        keys: keys of the unknowns, which cannot be turned too.
+    `worlds` are described sensor (of `count`) and known values of each view; unknown `keys` cannot be turned too.
     """
     lights = list(dict.fromkeys(key.rpartition(".")[0] for _, known in worlds for key in known))
     poses = {f"{light}.{name}" for light in lights for name in (_ROTATION, *(f"{_ROTATION}.{axis}" for axis in "xyz"))}

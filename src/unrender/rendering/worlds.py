@@ -33,13 +33,8 @@ from unrender.rendering.wrapper import RendererWrapper
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The scene and the known values that one sensor of a `WorldsRenderer` renders.
-
-    Attributes:
-        renderer: Renders the scene.
-        sensor: Index among the sensors of that renderer.
-        values: {key: value} of parameters that are known here: float32 arrays of the parameters' shapes.
-    """
+    """The scene and the known float32 values {key: array} that one sensor of a `WorldsRenderer` renders, a sensor of that scene's
+    renderer."""
 
     renderer: Renderer
     sensor: int
@@ -182,11 +177,7 @@ class WorldsRenderer(RendererWrapper):
         return parts
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
-        """Return the renderer with other meshes.
-
-        Raises:
-            InputError: there are several scenes.
-        """
+        """Return the renderer with other meshes. Raises `InputError` if there are several scenes."""
         if len(self.renderers) > 1:
             raise InputError(f"{', '.join(meshes)}: triangles cannot change where views show several scenes or AOVs")
         return super().with_meshes(meshes, keys)
@@ -224,14 +215,7 @@ class WorldsRenderer(RendererWrapper):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The paths of one state in a rendering.
-
-    Attributes:
-        state: Its index.
-        chosen: Positions of its pixels in the request; None for all.
-        count: Number of pixels of the request; 0 where `chosen` is None.
-        paths: Paths of the inner renderer.
-    """
+    """The paths of one state in a rendering; `chosen` are positions of its pixels among `count` in the request, None for all."""
 
     state: int
     chosen: np.ndarray | None
@@ -301,11 +285,8 @@ class WorldsSession:
         return _joined(counts, [_Part(n, chosen, count, None) for n, _, chosen in parts])
 
     def emitters(self) -> np.ndarray:
-        """Return the probabilities of the emitters, see `EmitterSession.emitters`.
-
-        Raises:
-            InputError: there are several scenes, or the session does not support other probabilities.
-        """
+        """Return the probabilities of the emitters. Raises `InputError` if there are several scenes, or the session supports no other
+        ones."""
         if len(self._sessions) > 1:
             raise InputError("views of several scenes do not support learned emitter sampling")
         return drawing_emitters(self._session(0)).emitters()

@@ -111,12 +111,10 @@ RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
 
 
 class PhaseTimes(Callback):
-    """Callback that records the seconds of each phase in `Result.phases`. It is the first callback, so that saved results contain them.
+    """Callback that records the seconds of each phase in `Result.phases`, after the `earlier` ones. It is the first callback, so that saved
+    results contain them.
 
     Compiling between steps, after a change of resolution or of a mesh, counts as compiling.
-
-    Args:
-        earlier: {phase: seconds} before the run, such as loading.
     """
 
     def __init__(self, earlier: Mapping[str, float] | None = None):

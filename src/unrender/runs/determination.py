@@ -48,13 +48,8 @@ _SEEDS, _RENDERINGS = (3, 4), 8
 
 @dataclass(frozen=True)
 class Change:
-    """Change of images as mean squares over pixels and channels.
-
-    Attributes:
-        square: mean square of the change without rendering noise; may be negative.
-        error: standard error of `square`.
-        scale: mean square of the images.
-    """
+    """Change of images as mean squares over pixels and channels: without rendering noise (may be negative), its standard error, and that of
+    the images."""
 
     square: float
     error: float
@@ -151,11 +146,7 @@ def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
 
 
 def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a line for each texture, grid or long list with a notable part that hardly changes the images.
-
-    Args:
-        sensitivities: {key: array}, see `unrender.runs.sensitivity`.
-    """
+    """Return a line for each texture, grid or long list with a notable part that hardly changes the images."""
     lines = []
     for key, sensitivity in sensitivities.items():
         is_long = sensitivity.ndim == 1 and sensitivity.size > MOST_ELEMENTS  # least squares test others one by one

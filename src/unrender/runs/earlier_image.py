@@ -31,13 +31,7 @@ reported of a run whose loss falls or may do so."""
 
 @dataclass(frozen=True)
 class EarlierImage:
-    """A new image of an earlier step.
-
-    Attributes:
-        step: number of completed steps.
-        picture: its picture, with the random numbers of other steps' ones.
-        pictures: renderer of the pictures of all steps.
-    """
+    """A new image of an earlier step, with the random numbers of other steps' ones."""
 
     step: int
     picture: Picture
@@ -105,13 +99,9 @@ def restored(saved: Mapping[str, Any], pictures: FreshPictures, like: Picture) -
 
 
 def stays(loss: float, step: int, change: float, error: float) -> bool:
-    """Return whether a loss has surely hardly fallen since a step.
+    """Return whether a loss has surely hardly fallen since a step, after which it changed by `change` with this standard error.
 
     The loss is that of pictures with little noise. A rise counts as no change, so a change whose noise is large proves nothing.
-
-    Args:
-        step: number of completed steps.
-        change, error: change of the loss since that step, and its standard error.
     """
     factor = _STILL_SHORT if step < FIRST_CANDIDATE else _STILL
     return (1.0 - factor) * loss + factor * min(change, 0.0) > _SURE * factor * error
@@ -158,13 +148,7 @@ def no_improvement(
 
 
 def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays: bool = True) -> Misfit:
-    """Return a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`, with its explanation.
-
-    Args:
-        differs: the difference.
-        step, steps: earlier step and last step that were compared.
-        stays: whether it is certain that the loss has hardly fallen.
-    """
+    """Return a difference at the end of a run whose loss has hardly fallen since `step`, certainly if `stays`, with its explanation."""
     cause = (
         "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
     )
@@ -188,9 +172,7 @@ def of_best(difference: Misfit, pictures: FreshPictures, best: Picture) -> Misfi
 def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> Misfit | None:
     """Return a difference of the image from the references of a tenth or more beyond noise if the loss still falls, or may do so.
 
-    Args:
-        last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
-            without progress, so neither is of averages.
+    Both images have the same random numbers. Averages over steps would lower the loss without progress, so neither is of averages.
     """
     residuals, pictures = last.residuals, last.pictures
     weights = pictures.weights_of(last.picture.images)

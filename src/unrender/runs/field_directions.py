@@ -140,13 +140,9 @@ def _remainder(numbers: Differences, of: Differences) -> Differences:
 
 
 def _sums(matrix: np.ndarray, first: int) -> np.ndarray | None:
-    """Return sums (K, k) of K directions that change the pictures independently; None for none.
+    """Return sums (K, k) of K directions that change the pictures independently, from products (K, K) of the changes; None for none.
 
-    The first ones are combined among themselves only, since sums with others would not trade off exactly.
-
-    Args:
-        matrix: products of the pictures' changes along the directions, (K, K).
-        first: number of the first directions.
+    The `first` ones are combined among themselves only, since sums with others would not trade off exactly.
     """
     if not np.isfinite(matrix).all():
         return None
@@ -185,10 +181,6 @@ class _Adjoints:
     """Approximate solutions w of J w = d, with the derivative J of the pictures by textures and grids.
 
     They are Jᵀ d divided by the diagonal of JᵀJ, the first iterate of Jacobi's method.
-
-    Args:
-        numbers: point and views.
-        sensitivities: {key: √diag(JᵀJ)}, see `unrender.sensitivity`.
     """
 
     def __init__(self, numbers: Numbers, keys: Sequence[str], sensitivities: Mapping[str, np.ndarray], key: Key):

@@ -275,13 +275,8 @@ def beyond_priors(
 ) -> Misfit:
     """Return a difference without `PRIOR` among its causes if steps against the pull of the priors explain little of it.
 
-    Of a run whose loss may still fall, they explain little even if a prior is the cause, so nothing is judged.
-
-    Args:
-        difference: difference of the final pictures from the references.
-        values: {key: array} at the end.
-        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
-        picture: see `Picture`.
+    Of a run whose loss may still fall, they explain little even if a prior is the cause, so nothing is judged. `ends`: see
+    `unexplained_pixels`.
     """
     if PRIOR not in difference.causes or STEPS in difference.causes or len(problem.unknowns) > _MOST_KEYS:
         return difference

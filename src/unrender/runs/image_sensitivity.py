@@ -165,12 +165,8 @@ def root_of_covariance(variance: np.ndarray | float, correlation: float) -> np.n
 
 
 def shown_elsewhere(problem: Problem, sensitivity: np.ndarray | None, step: np.ndarray | float, least: float) -> bool:
-    """Return whether a view beside those of `selected_views` may change by a root mean square of `least`.
-
-    Args:
-        sensitivity: change of all views per unit of each element, see `sensitivity`; None if it is unknown.
-        step: change of the elements.
-    """
+    """Return whether a view beside those of `selected_views` may change by a root mean square of `least`, for this `step` of the elements.
+    It is False for a `sensitivity` of all views that is unknown."""
     if sensitivity is None or len(selected_views(problem)) == len(problem.views):
         return False
     largest = max(height * width for height, width in problem.sizes)
@@ -264,14 +260,8 @@ def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
 
 
 def insensitive(values: np.ndarray) -> np.ndarray:
-    """Return a mask of the cells of a texture or grid whose smoothed sensitivity is below a tenth of the median of the non-zero ones.
-
-    Args:
-        values: result of `sensitivity`, (..., channels).
-
-    Returns:
-        (...), truth values.
-    """
+    """Return a mask (...) of the cells of a texture or grid whose smoothed `sensitivity` (..., channels) is below a tenth of the median of
+    the non-zero ones."""
     smoothed = around(values)
     return (
         smoothed <= _INSENSITIVE * np.median(smoothed[smoothed > 0])
@@ -281,24 +271,13 @@ def insensitive(values: np.ndarray) -> np.ndarray:
 
 
 def seen_cells(values: np.ndarray) -> np.ndarray | None:
-    """Return a mask of the cells of a texture or grid that affect the images, (...); None for other parameters.
-
-    Args:
-        values: result of `sensitivity`, (..., channels).
-    """
+    """Return a mask (...) of the cells of a texture or grid that affect the images, from `sensitivity`; None for other parameters."""
     return ~insensitive(values) if values.ndim >= MAP_AXES and values.size else None
 
 
 def seen_elements(values: np.ndarray) -> np.ndarray:
-    """Return a mask of the elements of a list, such as one of vertices, whose own sensitivity is at least a twentieth of the median of the
-    non-zero ones.
-
-    Args:
-        values: result of `sensitivity`, (N,).
-
-    Returns:
-        (N,), truth values. Few probes leave it uncertain for single elements.
-    """
+    """Return a mask (N,) of the elements of a list, such as one of vertices, whose own sensitivity is at least a twentieth of the median of
+    the non-zero ones. Few probes leave it uncertain for single elements."""
     return (
         values > _INSENSITIVE_ALONE * np.median(values[values > 0.0])
         if (values > 0.0).any()
@@ -359,17 +338,7 @@ def adjoints(
     seeds: Mapping[int, Key],
     pictures: Sequence[np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Return {key: Jᵀx, (k, *shape)} of k pictures x, from one rendering of each view.
-
-    Args:
-        problem: problem with views and scene.
-        session: session with derivatives with respect to `keys`.
-        parameters: point of the derivatives.
-        keys: keys of the parameters.
-        spp: samples per pixel of a rendering.
-        seeds: {view: key of its random numbers}.
-        pictures: (k, H, W, 3) for each of these views.
-    """
+    """Return {key: Jᵀx, (k, *shape)} of k pictures x (k, H, W, 3) for each view of `seeds`, from one rendering of the view."""
     count = len(pictures[0])
     sums = {key: np.zeros((count, *shape)) for key, shape in problem.shapes().items() if key in keys}
     for (view, seed), parts in zip(seeds.items(), pictures, strict=True):

@@ -106,11 +106,7 @@ def descend(run: Run) -> Result:
 
 
 def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
-    """Trace and compile every kernel of a step by taking two steps whose results are discarded.
-
-    Returns:
-        The elapsed seconds, and the snapshot after the two steps.
-    """
+    """Compile every kernel of a step by two steps whose results are discarded. Return the elapsed seconds, and the snapshot after these."""
     started = time.perf_counter()
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
     state = run.state
@@ -209,13 +205,8 @@ def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _Update:
-    """Result of an optimizer's update.
-
-    Attributes:
-        parameters, state: values after the update; large arrays of the state are not yet evaluated.
-        shortened: meshes whose triangles would have turned over.
-        not_finite: part that is not finite, "" for none; the update must then not be applied.
-    """
+    """Result of an optimizer's update: values and state, the part that is not finite, "" for none, and meshes whose triangles would have
+    turned over."""
 
     parameters: Tree
     state: Any

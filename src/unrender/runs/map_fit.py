@@ -73,11 +73,6 @@ def _may_explain(
 
     The products of a residual that some map removes and of changes of the pictures by random changes of the map have a sum that is not 0,
     or pixels that are three apart share their sign. Noise of the references is independent of these changes, from pixel to pixel.
-
-    Args:
-        values: {key: array} of the residuals' pictures.
-        residuals_of: `residuals_of_views` of all views.
-        pictures: see `no_better_maps`.
     """
     residuals, _, weights, sizes = residuals_of
     generator, most, shown = np.random.default_rng(0), 0.0, False

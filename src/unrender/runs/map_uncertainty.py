@@ -170,15 +170,7 @@ def of_residuals(
     known: Curvature,
     seed: int = 0,
 ) -> Uncertainty:
-    """Return the maps of `uncertainty` from known pictures and a known curvature.
-
-    Args:
-        problem: problem with views and scene.
-        values: {key: array} at the end of a run.
-        halves: two independent pictures (H, W, 3) of each view, without the references.
-        known: curvature at the values, with `pixel_noise`.
-        seed: seed of all random numbers.
-    """
+    """Return the maps of `uncertainty` from two independent pictures (H, W, 3) of each view and a curvature with `pixel_noise`."""
     infos = problem.renderer.parameters()
     shapes = problem.shapes()
     reasons = {key: _refusal(infos[key], known, key) for key, shape in shapes.items() if len(shape) >= MAP_AXES}
@@ -237,13 +229,8 @@ def no_maps(reasons: Mapping[str, str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Uncertainty of one parameter.
-
-    Attributes:
-        variance: variance of each element, (..., C).
-        share: share of the data in each element, (..., C).
-        of_noise: lower estimate of the fraction of the squared error by the references' noise, f² σ² / (m + (2 f − 1) σ²); 0 for small f.
-    """
+    """Variance and share of the data of each element, (..., C), and a lower estimate of the fraction of the squared error by the
+    references' noise, f² σ² / (m + (2 f − 1) σ²), 0 for small f."""
 
     variance: np.ndarray
     share: np.ndarray
@@ -252,13 +239,8 @@ class _Posterior:
 
 @dataclass(frozen=True)
 class _Cells:
-    """Texels of one parameter, with one curvature per texel.
-
-    Attributes:
-        change: change of each element from the start, (..., C).
-        curvature: mean diagonal element of each cell, (...), > 0.
-        noise: variance of the references' noise at each cell, (...).
-    """
+    """Texels of one parameter: change of each element from the start, (..., C); its mean curvature > 0 and noise of the references,
+    (...)."""
 
     change: np.ndarray
     curvature: np.ndarray
@@ -279,14 +261,8 @@ class _Cells:
     def posterior(
         self, gradients: tuple[np.ndarray, np.ndarray], smooth: float, noise_is_known: bool, prior: np.ndarray | float
     ) -> _Posterior | None:
-        """Return variances and shares of the data; None if samples are too few to tell the residual.
-
-        Args:
-            gradients: two independent Jᵀr, (..., C).
-            smooth: eigenvalue of smooth changes, see `Curvature`.
-            noise_is_known: whether the residual's noise is significant.
-            prior: curvature of the prior, (..., C).
-        """
+        """Return variances and shares of the data, from two independent Jᵀr (..., C); None if samples are too few to tell the residual.
+        `smooth` is the eigenvalue of `Curvature`, and `prior` the curvature of the prior."""
         counted, channels = self.counted, self.change.shape[-1]
         one, other = (self._difference(gradient, smooth) for gradient in gradients)
         explained = self.curvature * (one * other).mean(axis=-1)
@@ -317,11 +293,8 @@ class _Cells:
         return (gradient / roots - (1.0 - 1.0 / smooth) * shared) / roots
 
     def _followed(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return the fraction in [0, 1] of the solution's differences of neighbours that the parameters have; 1 if noise hides it.
-
-        Args:
-            one, other: two independent differences from the solution, (..., C).
-        """
+        """Return the fraction in [0, 1] of the solution's differences of neighbours that the parameters have, from two independent
+        differences from the solution, (..., C); 1 if noise hides it."""
         solutions = self.change - one, self.change - other
         total = _Mean.of(self._details(*solutions))
         own = float(self._details(self.change, 0.5 * (solutions[0] + solutions[1])).mean())

@@ -57,7 +57,7 @@ class PictureData:
     root: bool = False
 
     def png(self, exposure: float = 1.0, effort: int = 9) -> bytes:
-        """Encode as PNG by 0 to 9 of effort. `exposure` is a further factor of linear RGB, not of numbers."""
+        """Encode the picture as a PNG file of the compression level `effort`, 0 to 9. `exposure` is a further factor of linear RGB."""
         shown = reduced(self.values, _LARGEST)
         if self.map:
             shown = np.sqrt(np.maximum(shown, 0.0)) if self.root else shown

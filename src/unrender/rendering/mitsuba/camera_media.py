@@ -30,12 +30,8 @@ _AT_A_POINT = ("PerspectiveCamera", "ThinLensCamera", "RadianceMeter")
 def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
     """Return the medium of each sensor, None for a sensor outside all media.
 
-    A sensor's own `medium` takes precedence. Without one, its rays are traced to their first medium boundary, and the medium that most
-    of them come from is the sensor's. A warning is logged for each sensor whose medium is determined in this manner.
-
-    Args:
-        scene: `mitsuba.Scene`.
-        quiet: suppress the warnings.
+    A sensor's own `medium` takes precedence. Without one, its rays are traced to their first medium boundary, and the medium that most of
+    them come from is the sensor's. A warning is logged for each of these, unless `quiet`.
     """
     result = []
     for index, sensor in enumerate(scene.sensors()):

@@ -32,14 +32,6 @@ class CameraPaths:
     weight need not be 1 (an irradiancemeter's is π).
 
     This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
-
-    Args:
-        kernel: kernel that traces the paths.
-        scene, tables, sampler, ray, pair, geometry: arguments of `PathContext` and `PathKernel.sample`.
-        weight: the sensor's weight per ray and channel.
-
-    Attributes:
-        response: the film's response to the radiance of each ray.
     """
 
     def __init__(
@@ -161,11 +153,8 @@ _PENDING_SHARE = 8
 
 
 class DroppedSamples:
-    """Samples whose radiance is not finite. They contribute nothing to an image or a gradient, and are counted.
-
-    Args:
-        at_once: read each count immediately. Otherwise counts of several launches are read together, so that launches overlap.
-    """
+    """Samples whose radiance is not finite. They contribute nothing to an image or a gradient, and are counted: each launch `at_once`, or
+    several together, so that launches overlap."""
 
     def __init__(self, at_once: bool) -> None:
         self._report = DropReport()

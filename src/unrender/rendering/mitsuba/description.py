@@ -40,12 +40,8 @@ _NEEDED = {"bitmap": (_FILE, "bitmap", "data"), "blendbsdf": ("weight",)}
 
 @dataclass(frozen=True)
 class Parsed:
-    """A description that was parsed and checked.
-
-    Attributes:
-        config: `mitsuba.parser.ParserConfig` of the parse.
-        state: `mitsuba.parser.ParserState`; names of existing files are absolute.
-    """
+    """A description that was parsed and checked, as `mitsuba.parser.ParserConfig` and `ParserState`; names of existing files are
+    absolute."""
 
     config: Any
     state: Any
@@ -183,12 +179,7 @@ def _is_text(props: Any, name: str) -> bool:
 
 @dataclass
 class _Dictionary:
-    """Checker of a scene dictionary. Mitsuba's parser looks up plugins and reads spectra while it parses.
-
-    Attributes:
-        search: search path of the files that the dictionary names; its resource folders are added.
-        others: folders that Mitsuba searches afterwards.
-    """
+    """Checker of a scene dictionary, whose files are searched in `search`, to which its resource folders are added, then in `others`."""
 
     search: list[Path]
     others: Sequence[Path]

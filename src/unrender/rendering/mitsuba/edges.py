@@ -40,11 +40,8 @@ class MeshEdges:
 class EdgePoints:
     """Edges gathered per lane. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
 
-    Attributes:
-        start, end: `mi.Point3f`, attached if the caller resumes gradients.
-        third, other_third: `mi.Point3f`, opposite corners of two adjacent faces, equal if there is only one face; detached.
-        always: whether it may be a silhouette from every direction: at the border of a mesh, or with more than two faces.
-        crease: whether shading is discontinuous across the edge.
+    Start and end are attached if the caller resumes gradients; opposite corners are detached, and equal if there is only one face.
+    `always`: an edge at a border or of more than two faces. `crease`: shading is discontinuous across it.
     """
 
     def __init__(self, start: Any, end: Any, third: Any, other_third: Any, always: Any, crease: Any):
@@ -64,20 +61,10 @@ class EdgePoints:
 
 
 class EdgeTable:
-    """Edges of all meshes of a scene.
+    """Edges of all meshes of a scene: `count` in all, first the `moving` ones, of shapes that move.
 
-    Vertices at the same position are merged to match faces, so seams of texture coordinates are not borders. Triangles without area
-    have no edges.
-
-    Args:
-        scene: `mi.Scene`.
-        moving: ids of the shapes that move.
-        loaded: {id: positions (3 V,)} to match faces by, if a mesh may have other positions by now.
-
-    Attributes:
-        count: number of edges; those of moving shapes come first.
-        moving: number of edges of moving shapes.
-        lit: whether a moving shape emits light.
+    Vertices at the same position are merged to match faces, so seams of texture coordinates are not borders. `loaded` has positions {id: (3
+    V,)} to match faces by, if a mesh may have other ones by now. Triangles without area have no edges.
     """
 
     def __init__(self, scene: Any, moving: AbstractSet[str], loaded: Mapping[str, np.ndarray] | None = None):
@@ -173,14 +160,9 @@ def moving_targets(keys: Iterable[str]) -> frozenset[str]:
 def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     """Return the scene with these spheres replaced by meshes, and their ids.
 
-    Spheres are not replaced if they are emitters, sensors or boundaries of media, or if they are mirrors or glass, whose facets would
-    be visible. No sphere is replaced in a scene with a sensor that is a shape, nor on a GPU in one with shape groups.
-
-    The mesh has the sphere's texture coordinates and vertex normals, which are interpolated linearly.
-
-    Args:
-        scene: `mi.Scene`.
-        ids: ids of shapes, including spheres.
+    Spheres are not replaced if they are emitters, sensors or boundaries of media, or if they are mirrors or glass, whose facets would be
+    visible. No sphere is replaced in a scene with a sensor that is a shape, nor on a GPU in one with shape groups. The mesh has the
+    sphere's texture coordinates and vertex normals, which are interpolated linearly.
     """
     spheres = [shape for shape in scene.shapes() if shape.class_name() == "Sphere" and shape.id() in ids]
     spheres = [

@@ -63,20 +63,10 @@ def camera_samples(
     filters: PixelFilters | None = None,
     number: int = 0,
 ) -> CameraSamples:
-    """Return samples of one sensor's film; copies * count * spp lanes.
+    """Return samples of one sensor's film, or of its flat `pixels`, in `copies` concatenated images; copies * count * spp lanes.
 
-    Args:
-        sensor: `mitsuba.Sensor`.
-        sampler: `mitsuba.Sampler` ('independent'); seeded here.
-        seed: `mi.UInt32` of width 1.
-        spp: rays per pixel.
-        pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
-        count: number of pixels.
-        copies: number of concatenated copies of the image.
-        timed: whether sensors open at different times (`open_at_different_times`). The time is then an input of the shared kernel instead
-            of a constant.
-        filters: filters of all sensors; None for a box filter.
-        number: index of this sensor in `filters`.
+    The sampler is seeded here. The time of sensors that open at different times (`timed`) is an input of the shared kernel instead of a
+    constant. `number` is the index of this sensor in `filters`, which are None for a box filter.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
@@ -124,14 +114,8 @@ def open_at_different_times(sensors: Any) -> bool:
 def camera_samples_of_many(
     sensors: Any, films: Films, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
 ) -> CameraSamples:
-    """Return samples of pixels that belong to different sensors; count * spp lanes.
-
-    Args:
-        sensors: `mitsuba.SensorPtr`, all sensors of the scene.
-        films: data of all films, with the index of each pixel's sensor.
-        seed: see `camera_samples`, or the seed of each pixel.
-        sampler, spp, pixels, count: see `camera_samples`.
-    """
+    """Return samples of pixels that belong to different sensors, with one seed or the seed of each pixel; count * spp lanes. See
+    `camera_samples`."""
     lanes = count * spp
     pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, films.which))
     _seed(sampler, seed if dr.width(seed) == 1 else per_sample(seed, spp, count), lanes)
@@ -226,16 +210,10 @@ class Films:
 
 
 def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any:
-    """Return the mean of each pixel's samples, per group.
+    """Return the mean of each pixel's samples, per group: `mi.TensorXf` (groups, *shape).
 
-    Args:
-        radiance: `mi.Color3f`, samples of the film, evaluated, lanes in the order of `camera_samples`.
-        spp: samples per pixel, in all groups.
-        groups: number of equal, contiguous groups that a pixel's samples are split into.
-        shape: shape of one image, (H, W, 3) or (N, 3).
-
-    Returns:
-        `mi.TensorXf` (groups, *shape). Sums have a fixed order: equal seeds give equal bits.
+    `radiance` has evaluated samples, lanes in the order of `camera_samples`. Groups are equal and contiguous. Sums have a fixed order:
+    equal seeds give equal bits.
     """
     size = spp // groups
     sums = [dr.block_sum(radiance[c], size) if size > 1 else radiance[c] for c in range(3)]
@@ -249,16 +227,8 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any
 
 
 def film_adjoint(weights: Any, spp: int, count: int) -> Any:
-    """Return the adjoint of `develop` averaged over the groups: the weight of each lane.
-
-    Args:
-        weights: `mi.TensorXf` (groups, H, W, 3) or (groups, N, 3).
-        spp: samples per pixel, in all groups.
-        count: number of pixels.
-
-    Returns:
-        `mi.Color3f` per lane: weights[group, pixel] / spp.
-    """
+    """Return the adjoint of `develop` averaged over the groups: weights[group, pixel] / spp of each lane, for weights (groups, H, W, 3) or
+    (groups, N, 3)."""
     lane = dr.arange(mi.UInt32, count * spp)
     pixel = lane // spp
     group = (lane - pixel * spp) // (spp // weights.shape[0])
@@ -295,13 +265,7 @@ class ViewWeights:
 def views_of(
     request: SampleRequest, weights: mi.TensorXf, resolutions: Sequence[tuple[int, int]]
 ) -> Iterator[ViewWeights]:
-    """Yield the views that a request has pixels of.
-
-    Args:
-        request: request of the rendering.
-        weights: weights of `RenderSession.adjoint`, which are averaged over groups.
-        resolutions: (height, width) of each sensor's film.
-    """
+    """Yield the views that a request has pixels of, with weights of `RenderSession.adjoint`, averaged over groups."""
     groups = weights.shape[0]
     size = dr.width(weights.array) // groups
     lane = dr.arange(mi.UInt32, size)

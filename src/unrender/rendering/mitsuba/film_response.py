@@ -22,25 +22,15 @@ _STEP = 5.0
 
 @dataclass
 class SpectralSamples:
-    """Radiance of paths in a spectral variant, which a dataclass carries through recorded kernels.
-
-    Attributes:
-        film: `mi.Color3f`, weighted samples of the film.
-        spectrum: `mi.Spectrum`, unweighted radiance at the sampled wavelengths, which a replay needs.
-    """
+    """Radiance of paths in a spectral variant: weighted samples of the film; and, for a replay, unweighted radiance at the wavelengths."""
 
     film: Any
     spectrum: Any
 
 
 class FilmResponse:
-    """Linear map from the radiance of a ray to its sample of the film. This is not a dataclass, since Dr.Jit would treat it as loop state.
-
-    Args:
-        weight: the sensor's weight per ray and channel (`mi.Spectrum`).
-        wavelengths: the sampled wavelengths in nanometres; not used in RGB variants.
-        tables: `response_table()`, among other tables.
-    """
+    """Linear map from the radiance of a ray to its sample of the film, by the sensor's weights and the wavelengths in nanometres. This is
+    not a dataclass, since Dr.Jit would treat it as loop state."""
 
     def __init__(self, weight: Any, wavelengths: Any, tables: Mapping[str, Any]):
         self.weight = weight

@@ -54,9 +54,6 @@ def for_every_sensor(request: SampleRequest, sensors: Sequence[mi.Sensor], count
 
     A scene of one or two sensors, or with a sensor that a recording does not support, keeps the request: random numbers depend on the scene
     alone, not on other scenes of the process.
-
-    Args:
-        count: number of pixels.
     """
     supported = all(sensor.class_name() in _COMPLETE for sensor in sensors)
     if request.sensors is not None or len(sensors) < _MANY or not supported:
@@ -112,20 +109,14 @@ _INDEPENDENT = "the argument does not depend on the input variable"
 
 
 class FrozenFunction:
-    """A function that Dr.Jit records at its first call and replays at later ones. If it cannot be recorded, it is traced at each call.
+    """A function that Dr.Jit records at its first call and replays at later ones. If it is not `recordable`, it is traced at each call.
 
-    A virtual call sees the objects of every scene in the process, including the caller's own. Some of them build tables at their first
-    use, which cannot be recorded. Those of textured lights are built before the first recording. The traced call after a failure builds
-    others, and scenes that are no longer used are freed. The next call therefore records again, up to three consecutive times.
+    A virtual call sees the objects of every scene in the process, including the caller's own. Some of them build tables at their first use,
+    which cannot be recorded. Those of textured lights are built before the first recording. The traced call after a failure builds others,
+    and scenes that are no longer used are freed. The next call therefore records again, up to three consecutive times.
 
-    An error in a replay is raised, since out of memory, for example, does not justify tracing at every later call.
-
-    Mitsuba objects outside the scenes that are passed in, even unused ones, can prevent Dr.Jit from recording.
-
-    Args:
-        function: function of device arrays and Mitsuba objects. It may be called again after it failed.
-        recordable: whether to record it at all.
-        keys: the parameters that an error about a picture without derivatives names.
+    An error in a replay is raised, since out of memory, for example, does not justify tracing at every later call. Mitsuba objects outside
+    the scenes that are passed in, even unused ones, can prevent Dr.Jit from recording.
     """
 
     def __init__(self, function: Callable[..., Any], recordable: bool = True, keys: Collection[str] = ()):

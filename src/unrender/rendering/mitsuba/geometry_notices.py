@@ -22,13 +22,9 @@ _NEAR = 1e-3
 
 
 def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
-    """Return a notice about each mesh with unknown vertices that touches or crosses other shapes, as loaded.
+    """Return a notice about each mesh with unknown vertices that touches or crosses other shapes, as loaded, in a scene without instances.
 
     The middle of an edge touches a shape on a normal of the edge's faces. Ends of edges do not count: they may meet a shape at one point.
-
-    Args:
-        scene: `mi.Scene` without instances.
-        keys: the unknown parameters.
     """
     lines = []
     for mesh in _unknown_meshes(scene, keys):
@@ -64,12 +60,7 @@ _SIDE, _HITS, _SHARE = 64, 6, 0.05
 
 
 def specular_notices(scene: Any, keys: Collection[str]) -> list[str]:
-    """Return a notice about each mesh with unknown vertices that views show in perfect mirrors or through smooth glass, as loaded.
-
-    Args:
-        scene: `mi.Scene`.
-        keys: the unknown parameters.
-    """
+    """Return a notice about each mesh with unknown vertices that views show in perfect mirrors or through smooth glass, as loaded."""
     meshes = _unknown_meshes(scene, keys)
     if not meshes or not any(is_mirror_or_glass(shape.bsdf()) for shape in scene.shapes()):
         return []
@@ -121,12 +112,7 @@ _POINTS, _SHADED = 4096, 0.01
 
 
 def shadow_notices(scene: Any, keys: Collection[str]) -> list[str]:
-    """Return a notice about each shape that is not a mesh and casts a shadow on a mesh with unknown vertices, as loaded.
-
-    Args:
-        scene: `mi.Scene`.
-        keys: the unknown parameters.
-    """
+    """Return a notice about each shape that is not a mesh and casts a shadow on a mesh with unknown vertices, as loaded."""
     others = [shape for shape in scene.shapes() if not (shape.is_mesh() or shape.is_emitter() or shape.is_sensor())]
     round_ones, lines = [shape for shape in others if not _is_null(shape)], []
     known = bool(round_ones and scene.emitters()) and not has_instances(scene)
@@ -158,13 +144,7 @@ _FLAT = 1e-4
 
 
 def jump_notices(scene: Any, graph: ObjectGraph, keys: Collection[str]) -> list[str]:
-    """Return a notice about each mesh with unknown vertices whose material has a texture with jumps.
-
-    Args:
-        scene: `mi.Scene`.
-        graph: its objects.
-        keys: the unknown parameters.
-    """
+    """Return a notice about each mesh with unknown vertices whose material has a texture with jumps."""
     if is_spectral():
         return []
     lines = []

@@ -83,13 +83,7 @@ def _masks_obstacle(pair: ScenePair) -> str:
 
 
 class BoundaryTerm:
-    """Boundary derivatives with respect to parameters that move meshes, which are added to those of path replay.
-
-    Args:
-        pair: both loads of the scene.
-        moving: ids of the shapes that move.
-        paths: settings of the light paths.
-    """
+    """Boundary derivatives with respect to parameters that move meshes, which are added to those of path replay."""
 
     def __init__(self, pair: ScenePair, moving: Iterable[str], paths: LightPaths):
         scene = pair.loaded()
@@ -103,15 +97,11 @@ class BoundaryTerm:
         self._resolutions = pair.resolutions
 
     def accumulate(self, scene: LoadedScene, request: SampleRequest, weights: mi.TensorXf) -> None:
-        """Add the boundary term of the mean over groups g of sum(weights[g] * image) to the gradients of the scene's leaves.
+        """Add the boundary term of the mean over groups g of sum(weights[g] * image) to the gradients of the leaves of a scene with
+        attached parameters.
 
         It takes as many samples as the request, rounded up to a power of two if the request chooses pixels. Their random numbers are
         independent of those of the rendering.
-
-        Args:
-            scene: its parameters are set and attached.
-            request: request of the rendering.
-            weights: weights of `RenderSession.adjoint`.
         """
         for view in views_of(request, weights, self._resolutions):
             sensor, seed, samples = self._samples(scene, request, view)
@@ -122,15 +112,9 @@ class BoundaryTerm:
     def tangent_moment(
         self, scene: LoadedScene, request: SampleRequest, combined: tuple[float, ...] | None = None
     ) -> mi.TensorXf:
-        """Return the squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3).
-
-        It takes as many samples as `accumulate`. Their noise is part of the second moment, as it is of the gradient.
-
-        Args:
-            scene: its parameters are set, and have tangents.
-            request: request of the rendering.
-            combined: channel weights of a sum that is squared in place of each channel; None to square each channel.
-        """
+        """Return the squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3): of each channel, or of
+        the sum with the weights `combined`. It takes as many samples as `accumulate`. Their noise is part of the second moment, as it is of
+        the gradient."""
         count = math.prod(self._resolutions[request.sensor]) if request.pixels is None else dr.width(request.pixels)
         moments = dr.zeros(mi.Float, 3 * count)
         zeros = dr.zeros(mi.TensorXf, (1, count, 3))
@@ -236,14 +220,8 @@ def no_tangents(keys: Iterable[str]) -> str:
 
 
 class CameraTerm:
-    """Derivatives with respect to sensor parameters, which are added to those of path replay with fixed camera rays.
-
-    Args:
-        pair: both loads of the scene.
-        keys: keys of the parameters, all of sensors.
-        max_depth: maximum path length in segments, >= 1.
-        still: whether shapes do not move.
-    """
+    """Derivatives with respect to sensor parameters, which are added to those of path replay with fixed camera rays. Shapes may be
+    `still`."""
 
     def __init__(self, pair: ScenePair, keys: Iterable[str], max_depth: int, still: bool):
         scene = pair.loaded()

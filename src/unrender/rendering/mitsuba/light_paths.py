@@ -58,15 +58,8 @@ class LightPaths:
 
     @classmethod
     def of(cls, scene: mi.Scene, volumetric: bool, max_depth: int | None) -> LightPaths:
-        """Return the settings of a scene.
-
-        Args:
-            scene: the loaded scene.
-            volumetric: whether it has participating media.
-            max_depth: in segments; None for the value of the scene's integrator.
-
-        Raises `InputError` if emitters are hidden in a scene with media.
-        """
+        """Return the settings of a scene, with the scene's own depth if `max_depth` is None. Raises `InputError` if emitters are hidden in
+        a scene with media."""
         integrator = scene.integrator()
         if integrator is None:
             return cls(max_depth or DEFAULT_DEPTH)
@@ -106,10 +99,6 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
     """Return one notice for a scene whose references Mitsuba's path integrator would render wrongly.
 
     In Mitsuba 3.9.1 `path` multiplies light sampled from emitters by the square of a mask's opacity; `prb`, `volpath` and `direct` do not.
-
-    Args:
-        scene: the loaded scene.
-        keys: the unknown parameters.
     """
     integrator = scene.integrator()
     if integrator is not None and _kind(_light_transport(integrator)) != "PathIntegrator":
@@ -124,14 +113,7 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
 
 
 def null_notices(scene: mi.Scene, bsdfs: Iterable[Any], volumetric: bool, max_depth: int) -> list[str]:
-    """Return one notice if the scene's integrator counts fewer segments than the kernel for scenes without participating media.
-
-    Args:
-        scene: the loaded scene.
-        bsdfs: BSDFs of the scene.
-        volumetric: whether it has participating media.
-        max_depth: maximum path length in segments.
-    """
+    """Return one notice if the scene's integrator counts fewer segments than the kernel for scenes without participating media."""
     integrator = scene.integrator()
     kind = "" if integrator is None else _kind(_light_transport(integrator))
     passed = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)

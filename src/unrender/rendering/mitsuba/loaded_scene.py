@@ -112,13 +112,8 @@ _OF_MITSUBA = re.compile(r"\[\w+\.(h|cpp):\d+\]")
 
 @dataclass(frozen=True)
 class _Setting:
-    """A value that a parameter was set to.
-
-    Attributes:
-        value: the value, with its own reference to the memory.
-        attached: whether it was set as a leaf of the derivative graph.
-        spent: whether the next setting must replace the leaf, since its tangents were propagated.
-    """
+    """A value that a parameter was set to, whether as a leaf of the derivative graph, and whether that is spent: its tangents were
+    propagated."""
 
     value: mi.TensorXf
     attached: bool
@@ -209,12 +204,8 @@ class LoadedScene:
         return tuple(tuple(setting.value.shape) for setting in self._settings.values())
 
     def set_parameters(self, values: Tree, attached: AbstractSet[str] = frozenset()) -> None:
-        """Set these parameters to these values and all others to the scene's own. Nothing happens if this is already the case.
-
-        Args:
-            values: {key: `mi.TensorXf`}.
-            attached: keys of the parameters that are leaves of the derivative graph.
-        """
+        """Set these parameters to these values and all others to the scene's own; those `attached` are leaves of the derivative graph.
+        Nothing happens if this is already the case."""
         unset = [key for key in self._settings if key not in values]
         self._restore(unset)
         changed = [key for key, value in values.items() if not self._is_set(key, value, key in attached)]

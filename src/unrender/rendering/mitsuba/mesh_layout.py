@@ -36,11 +36,7 @@ def traverse(node: Any) -> Any:
 
 
 def parameters(properties: dict[str, Any], hierarchy: dict[Any, Any]) -> Any:
-    """Return the `mitsuba.SceneParameters` of traversed objects, with the names and flat arrays of this package.
-
-    Args:
-        properties, hierarchy: attributes of a `mitsuba.SceneParameters`.
-    """
+    """Return the `mitsuba.SceneParameters` of traversed objects, with the names and flat arrays of this package."""
     named: dict[Any, set[str]] = {}
     for key, entry in properties.items():
         named.setdefault(entry[2], set()).add(key.rpartition(".")[2])
@@ -142,16 +138,8 @@ def build(
     texcoords: np.ndarray | None = None,
     bsdf: Any = None,
 ) -> Any:
-    """Return a new mesh with smooth normals.
-
-    Args:
-        name: name for messages. The id is set by the scene's description, since two objects may hold meshes of one name.
-        points: (V, 3).
-        triangles: vertex indices, (F, 3).
-        normals: (V, 3); None for those that Mitsuba computes.
-        texcoords: (V, 2); None for none.
-        bsdf: `mitsuba.BSDF`; None for Mitsuba's default.
-    """
+    """Return a new mesh with the given normals (V, 3), or smooth ones that Mitsuba computes. The name is for messages. The id is set by the
+    scene's description, since two objects may hold meshes of one name."""
     arrays = {
         POSITIONS: np.ascontiguousarray(points, np.float32),
         NORMALS: None if normals is None else np.ascontiguousarray(normals, np.float32),

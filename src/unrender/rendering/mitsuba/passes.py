@@ -26,14 +26,8 @@ Rays = list[tuple[Any, Any]]
 
 @dataclass(frozen=True)
 class LaunchSize:
-    """Constants that a kernel is compiled for.
-
-    Attributes:
-        sensor: index of the sensor; ignored if each pixel has its own.
-        spp: samples per pixel.
-        hiding: whether emitters are invisible to camera rays.
-        strata: number of adjacent samples whose random numbers are stratified together; 1 for independent numbers.
-    """
+    """Constants that a kernel is compiled for. `hiding`: emitters are invisible to camera rays. `strata`: number of adjacent samples that
+    are stratified together, 1 for independent ones."""
 
     sensor: int
     spp: int
@@ -126,13 +120,7 @@ class Pass:
         return launch
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        """Return the call that traces the camera rays, by default without derivatives.
-
-        Args:
-            paths: paths that begin on the rays.
-            size: constants that the kernel is compiled for.
-            own: the pass's own arrays.
-        """
+        """Return the call that traces the camera rays, by default without derivatives; `own` are the pass's own arrays."""
         del size, own
         return paths.primal()
 
@@ -164,13 +152,7 @@ class ImagePairPass(Pass):
 
 @dataclass(frozen=True)
 class MovedPairPass(Pass):
-    """Radiance of both states per lane on related paths, for moving shapes.
-
-    Attributes:
-        moving: ids of the meshes that move.
-        tracer: tracer of related paths.
-        still_sensors: whether both states have the same sensors.
-    """
+    """Radiance of both states per lane on related paths, for moving meshes. The sensors of both may be equal (`still_sensors`)."""
 
     moving: frozenset[str]
     tracer: MovedPair
@@ -224,11 +206,7 @@ class AdjointPass(Pass):
 
 @dataclass(frozen=True)
 class AdjointPairPass(Pass):
-    """Backward path replay of both states, on the current state's paths.
-
-    Attributes:
-        both: whether the previous state's leaves accumulate gradients as well.
-    """
+    """Backward path replay of both states, on the current state's paths; gradients accumulate in `both` or in the current state alone."""
 
     both: bool = True
     pair: ClassVar[bool] = True
@@ -244,11 +222,7 @@ class AdjointPairPass(Pass):
 
 @dataclass(frozen=True)
 class TangentPass(Pass):
-    """Forward path replay: the squared derivative of each lane's radiance along the tangents.
-
-    Attributes:
-        combined: channel weights of a sum that is squared in place of each channel; None to square each channel.
-    """
+    """Forward path replay: the squared derivative along the tangents of each lane's radiance, or of its sum with the weights `combined`."""
 
     combined: tuple[float, ...] | None = None
     needs_tangents: ClassVar[bool] = True
@@ -267,11 +241,7 @@ class TangentPass(Pass):
 
 @dataclass(frozen=True)
 class ConnectionsPass(Pass):
-    """Forward path replay: values of the emitter-sampling connections of each lane's path.
-
-    Attributes:
-        bounces: maximum number of connections per path.
-    """
+    """Forward path replay: values of the emitter-sampling connections of each lane's path, at most `bounces`."""
 
     bounces: int
     needs_tangents: ClassVar[bool] = True

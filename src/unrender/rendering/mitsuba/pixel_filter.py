@@ -96,14 +96,7 @@ class PixelFilters:
         )
 
     def sample(self, u: Any, pixel: Any, count: Any, film: Any) -> tuple[Any, Any]:
-        """Return offsets from the centres of pixels, and their weights.
-
-        Args:
-            u: uniform in [0, 1).
-            pixel: index of the pixel's row or column.
-            count: number of rows or columns.
-            film: `mi.UInt32`, index of the sensor.
-        """
+        """Return offsets from the centres of pixels, and their weights, for uniform `u` and rows or columns `pixel` of `count`."""
         first, reach = dr.gather(mi.UInt32, self.first, film), dr.gather(mi.UInt32, self.reach, film)
         below, above = dr.minimum(pixel, reach), dr.minimum(count - 1 - pixel, reach)
         row = first + below * (reach + 1) + above
@@ -147,9 +140,6 @@ class FilterSlopes:
     """Distributions of the increase and decrease of one film's pixel filters, along one axis. A box filter only changes at its border.
 
     The derivative of a pixel's normalised filter, including its truncation, is a positive and a negative measure of equal mass.
-
-    Args:
-        film: `mitsuba.Film`.
     """
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
@@ -197,11 +187,7 @@ _integrals: dict[_Kind, list[float]] = {}
 
 
 class FilterStencil:
-    """Pixels of one film that a sample contributes to, with the weights of the film.
-
-    Args:
-        film: `mitsuba.Film`.
-    """
+    """Pixels of one film that a sample contributes to, with the weights of the film."""
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, film: Any):
@@ -233,12 +219,8 @@ class FilterStencil:
         )
 
     def add(self, position: Any, each: Callable[[Any, Any, Any], None]) -> None:
-        """Call `each` for each pixel that samples at `position` contribute to.
-
-        Args:
-            position: `mi.Point2f` in pixels.
-            each: function of the pixel's index (`mi.UInt32`), the weight (`mi.Float`) and whether the pixel is in the film (`mi.Bool`).
-        """
+        """Call `each` with index, weight and whether it is in the film for each pixel that samples at `position`, in pixels, contribute
+        to."""
         width, height = self._size
         if self._box:
             x = dr.clip(mi.Int32(dr.floor(position.x)), 0, width - 1)

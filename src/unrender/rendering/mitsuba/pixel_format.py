@@ -41,11 +41,7 @@ def formats(sensors: Sequence[Any]) -> list[PictureFormat]:
 
 
 class LuminanceSession(SessionWrapper):
-    """A session whose images have the luminance in all three channels.
-
-    Args:
-        inner: session that renders RGB.
-    """
+    """A session whose images have the luminance in all three channels."""
 
     _inner: MitsubaSession | CachingSession
 

@@ -127,14 +127,8 @@ def is_bare(scene: Any, target: str) -> bool:
 
 
 def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -> ParameterInfo:
-    """Return the description of a pose parameter.
-
-    Args:
-        key: meaning of its key.
-        obstacle: reason why path gradients do not support it; "" if they do.
-        sensor: index of the sensor that it moves; None if it does not move a sensor.
-        length: order of magnitude of lengths at the object, see `rigid_motions.lengths`.
-    """
+    """Return the description of a pose parameter; `obstacle` is the reason why path gradients do not support it, `sensor` the index of a
+    sensor that it moves, and `length` the order of magnitude of lengths at the object, see `rigid_motions.lengths`."""
     viewpoint = sensor is not None
     kind = "light" if key.light else "sensor" if viewpoint else "shape"
     reason = f"it moves a {kind} rigidly"
@@ -253,13 +247,7 @@ class PosedScene:
         return np.array(poses, np.float32).reshape(-1, count)
 
     def at(self, scenes: list[Any], numbers: Any, batch: Any) -> Assembly:
-        """Return the scene with each lane's poses.
-
-        Args:
-            scenes: `scenes()`, as an input of the frozen kernel.
-            numbers: `numbers()`, raveled, on the device.
-            batch: index of the lane's pose, per lane.
-        """
+        """Return the scene with each lane's poses, from `scenes()` and raveled `numbers()`; `batch` is the index of the lane's pose."""
         count = dr.width(numbers) // (7 * len(self._centres))
         poses = {}
         for index, (name, centre) in enumerate(self._centres.items()):
@@ -322,12 +310,7 @@ class Assembly:
 
 
 def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return {id of a shape or sensor: (4, 4)}, the matrix that multiplies its `to_world` from the left in these poses.
-
-    Args:
-        scene: the loaded scene.
-        parameters: {key: value} of poses.
-    """
+    """Return {id of a shape or sensor: (4, 4)}, the matrix that multiplies its `to_world` from the left in these poses."""
     from scipy.spatial.transform import Rotation
 
     known = keys(scene)
@@ -384,14 +367,8 @@ def slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
 def numbers_of(
     target: str, slots: Mapping[str, tuple[str, int, int]], values: Mapping[str, Any], zero: Any, one: Any
 ) -> list[Any]:
-    """Return the 7 numbers of a target's pose: translation, rotation vector, scale.
-
-    Args:
-        target: id of a shape, an emitter or a sensor.
-        slots: `slots()` of all chosen keys.
-        values: {key: its numbers, one after the other}; a missing key is as loaded.
-        zero, one: the numbers of a pose as loaded.
-    """
+    """Return the 7 numbers of a target's pose: translation, rotation vector, scale; those of missing keys are `zero` and `one`, as
+    loaded."""
     numbers = [zero] * 6 + [one]
     for key, (owner, first, size) in slots.items():
         if owner == target and key in values:

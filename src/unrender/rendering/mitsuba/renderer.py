@@ -328,14 +328,8 @@ class MitsubaRenderer:
 
 
 class StockSession:
-    """A load of the scene for `mi.render` alone, with the scene's own film and reconstruction filter.
-
-    Args:
-        description: what to load.
-        moving: ids of shapes that move; spheres among them become meshes.
-        volumetric: whether there is a participating medium, which selects `prbvolpath` instead of `prb`.
-        paths: settings of the light paths.
-    """
+    """A load of the scene for `mi.render` alone, with the scene's own film and reconstruction filter, by `prbvolpath` if `volumetric`, else
+    `prb`."""
 
     def __init__(self, description: SceneDescription, moving: AbstractSet[str], volumetric: bool, paths: LightPaths):
         self._loaded = LoadedScene(description, moving)

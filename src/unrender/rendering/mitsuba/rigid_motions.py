@@ -16,12 +16,8 @@ from unrender.rendering.mitsuba.poses import Pose, PoseKey
 
 
 class RigidMotions:
-    """Pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write.
-
-    Args:
-        scene: the loaded scene.
-        own: {key: value} of Mitsuba's parameters, as loaded; referenced, not copied.
-    """
+    """Pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write; `own` are the loaded values,
+    not copied."""
 
     def __init__(self, scene: Any, own: Mapping[str, Any]):
         known = poses.keys(scene)
@@ -70,11 +66,7 @@ class RigidMotions:
             self._set_world(parameters, name, _copy(self._worlds[target]))
 
     def write(self, parameters: mi.SceneParameters, values: Mapping[str, Any]) -> None:
-        """Move the targets, with derivatives if the poses are attached, and update the scene.
-
-        Args:
-            values: {key: `mi.Float`} of all poses that are set.
-        """
+        """Move the targets to the values of all poses that are set, with derivatives if these are attached, and update the scene."""
         rotated: dict[str, Any] = {}
         for target, pose in self._poses(values).items():
             name = self._written(target)

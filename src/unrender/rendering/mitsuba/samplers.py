@@ -13,14 +13,10 @@ from unrender.rendering.mitsuba.film import per_sample
 
 @dataclass
 class RepeatingSampler:
-    """Sampler of independent numbers that are equal in every copy of an image: lane i shares its numbers with lane i + period.
+    """Sampler of independent numbers that are equal in every copy of an image: lane i shares its numbers with lane i + period, or with that
+    of `lanes`.
 
     It replaces a `mitsuba.Sampler`. It is mutable, as that is, since it is state of the path tracer's loop.
-
-    Attributes:
-        period: number of lanes of one image.
-        rng: `mitsuba.PCG32`, once seeded.
-        lanes: `mi.UInt32`, for each lane the lane whose numbers it uses; None for its own.
     """
 
     period: int
@@ -57,15 +53,8 @@ class RepeatingSampler:
 class StratifiedSampler:
     """Sampler whose numbers are stratified over groups of lanes, such as the samples of a pixel.
 
-    Each pair of numbers is of a randomised (0, 2)-sequence in random order. Numbers are uniform, and groups are independent. So are the
-    pairs of a lane. Copies of an image have equal numbers, see `RepeatingSampler`.
-
-    Attributes:
-        period: number of lanes of one image.
-        size: number of adjacent lanes that are stratified together.
-        group: `mi.UInt32`, random number of each lane's group of that size, once seeded.
-        sample: `mi.UInt32`, index of each lane in its group.
-        pair: `mi.UInt32`, number of pairs so far.
+    Each pair of numbers is of a randomised (0, 2)-sequence in random order. Numbers are uniform, and groups of `size` lanes are
+    independent. So are the pairs of a lane. Copies of an image have equal numbers, see `RepeatingSampler`.
     """
 
     period: int
@@ -123,11 +112,6 @@ def independent(sampler: Any, lanes: int) -> RepeatingSampler:
 
 
 def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:
-    """Return the sampler of a part of an image, in which each pixel has the same numbers as in the full image.
-
-    Args:
-        positions: `mi.UInt32`, index of each pixel in the full image.
-        spp, count: samples per pixel and number of pixels of the part.
-    """
+    """Return the sampler of a part of an image, in which each pixel has the same numbers as at its position in the full image."""
     sample = dr.arange(mi.UInt32, count * spp) % spp
     return RepeatingSampler(count * spp, lanes=per_sample(positions, spp, count) * spp + sample)

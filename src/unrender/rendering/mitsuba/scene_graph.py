@@ -117,11 +117,8 @@ class ObjectGraph:
                 yield [node, *chain]
 
     def tables(self, other: ObjectGraph) -> dict[str, mi.UInt32]:
-        """Return tables from the registry ids of this scene's objects to those of another load, by kind.
-
-        Raises:
-            InputError: the two loads differ, or a path can meet an object that the traversal does not show.
-        """
+        """Return tables from the registry ids of this scene's objects to those of another load, by kind. Raises `InputError` if the loads
+        differ, or a path can meet an object that the traversal does not show."""
         if [type(node) for node in self.nodes] != [type(node) for node in other.nodes]:
             raise InputError(
                 "scene: two loads of the description have different objects; expected equal ones, or use --method plain"

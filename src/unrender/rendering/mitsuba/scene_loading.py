@@ -158,13 +158,8 @@ def _numbered(slots: Iterable[tuple[tuple[str, str], Any]]) -> list[tuple[Medium
 
 
 def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumKey, np.ndarray]:
-    """Return the affine map (4, 4) from [0, 1]³ to the world of each medium's extinction grid.
-
-    Media and volumes that are ready-made objects are omitted.
-
-    Args:
-        description: an XML file or a Mitsuba dictionary of a valid scene.
-    """
+    """Return the affine map (4, 4) from [0, 1]³ to the world of each medium's extinction grid, of a valid description. Media and volumes
+    that are ready-made objects are omitted."""
     nodes: Any = parse(description).state.nodes
     top = list(_children(nodes, nodes[0]).values())
     groups = [node for node in top if node.props.plugin_name() == "shapegroup"]
@@ -211,13 +206,7 @@ _INDEXED = "serialized"
 
 
 def conversion(parameters: mi.SceneParameters, key: str, description: SceneDescription) -> FileConversion:
-    """Return how Mitsuba converts a file to the values of the parameter `key`.
-
-    Args:
-        parameters: parameters of the loaded scene.
-        key: key of a parameter that is an array.
-        description: what the scene was loaded from; its shapes place the vertices of mesh files.
-    """
+    """Return how Mitsuba converts a file to the values of the array `key`. Shapes of the description place the vertices of mesh files."""
     value, node = parameters[key], parameters.properties[key][2]
     if isinstance(node, mi.Mesh) and key.rpartition(".")[2].startswith(("vertex_", "face_")):
         return FileConversion(vertices=partial(read_vertices, description, key))
@@ -286,9 +275,6 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[Equal, ...]:
     """Return the objects that Mitsuba merges with equal ones, one tuple per set. An object that is held by reference counts once.
 
     Each object is the tuple of its names: the one of `_name`, and one for each slot that holds it.
-
-    Args:
-        nodes: nodes of `mitsuba.parser.ParserState`, references resolved.
     """
     contents: dict[int, Any] = {}
     order = _from_scene(nodes)
@@ -306,12 +292,7 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[Equal, ...]:
 
 
 def merge_notices(keys: Iterable[str], equal: Sequence[Equal]) -> list[str]:
-    """Return one notice for each parameter whose object has equal objects; parameters that equal one another share it.
-
-    Args:
-        keys: keys of the unknowns.
-        equal: result of `equal_objects`.
-    """
+    """Return one notice for each unknown whose object has `equal_objects`; parameters that equal one another share it."""
     notices: list[str] = []
     named: set[str] = set()
     for key in keys:

@@ -49,12 +49,7 @@ def channels(value: Any) -> int:
 
 
 def refusal(scene: Any, holders: Holders) -> str:
-    """Return the reason why spectral variants do not support a scene; "" if they do, and in RGB variants.
-
-    Args:
-        scene: the loaded `mi.Scene`.
-        holders: the objects of the scene, with the slots that hold each of them.
-    """
+    """Return the reason why spectral variants do not support a scene; "" if they do, and in RGB variants."""
     if not is_spectral():
         return ""
     instead = f"use the variant {str(mi.variant()).replace('spectral', 'rgb')}"
@@ -78,15 +73,8 @@ def refusal(scene: Any, holders: Holders) -> str:
 
 
 class SpectralColours:
-    """The parameters of a scene that hold coefficients, and their conversion. It converts nothing in RGB variants.
-
-    Args:
-        parameters: parameters of the loaded scene.
-        readers: slots that read them.
-
-    Attributes:
-        keys: the converted parameters; their arrays have three channels.
-    """
+    """The parameters (`keys`, of three channels) of a scene that hold coefficients, and their conversion. It converts nothing in RGB
+    variants."""
 
     def __init__(self, parameters: mi.SceneParameters, readers: SlotReaders):
         self._parameters, self._readers = parameters, readers
@@ -168,13 +156,9 @@ class SpectralColours:
 
 
 class _Cell:
-    """The cell of the table that contains each colour. Arrays of three are lists.
+    """The cell of the table that contains each colour of three channels in [0, 1]. Arrays of three are lists.
 
-    Args:
-        knots: positions of the samples in z.
-        data: coefficients of [largest channel, z, y, x], flat.
-        size: samples along each axis.
-        rgb: the three channels, in [0, 1].
+    `knots` are positions of the samples in z, and `data` the coefficients of [largest channel, z, y, x], flat.
     """
 
     def __init__(self, knots: mi.Float, data: mi.Float, size: int, rgb: list[Any]):

@@ -37,13 +37,7 @@ def turnable(scene: Any) -> tuple[str, ...]:
 
 
 def with_turns(scene: Any, turns: Turns | None, description: SceneDescription) -> Any:
-    """Return the scene with its lights turned for each sensor.
-
-    Args:
-        scene: the loaded scene; its objects become part of the result.
-        turns: rotations of its lights, and the sensors; None for the scene itself.
-        description: what the scene was loaded from.
-    """
+    """Return the scene with its lights turned for each sensor; the scene itself for None. Its objects become part of the result."""
     if turns is None:
         return scene
     sensors = [*scene.sensors()]

@@ -92,16 +92,10 @@ def write(
 def candidates(
     folder: Path, reject: Callable[[Checkpoint], str] = lambda _: ""
 ) -> Iterator[tuple[Checkpoint | None, list[str]]]:
-    """Yield the readable checkpoints of a run folder that are not rejected, latest first; None alone if there are none.
+    """Yield the readable checkpoints of a run folder that `reject` returns "" for, latest first; None alone if there are none.
 
-    Args:
-        reject: function that returns why a checkpoint is unsuitable, "" if it is suitable.
-
-    Yields:
-        Each checkpoint with one line for every later one that was skipped, in a list to which the caller may add why it skips this one.
-
-    Raises:
-        InputError: all existing checkpoints were skipped; the message is that of the latest.
+    Each comes with one line for every later one that was skipped, in a list to which the caller may add why it skips this one. Raises
+    `InputError`, the message of the latest, if all existing checkpoints were skipped.
     """
     root = folder / FOLDER
     if root.is_symlink():

@@ -82,12 +82,7 @@ def encoded_record(folder: Path, result: Result, status: str, error: str = "") -
 
 
 def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
-    """Return the contents of run.json, see `schema.RunRecord`.
-
-    Args:
-        status: "running", or a value of `Result.status`.
-        error: exception by which the run failed; "" for none.
-    """
+    """Return the contents of run.json, see `schema.RunRecord`, of a run that failed by the exception `error`, "" for none."""
     if status == "failed" and not error:
         error = "stopped: the last gradients were not finite"
     fields: dict[str, Any] = {

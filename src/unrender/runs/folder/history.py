@@ -160,12 +160,7 @@ def read_records(path: Path, folder: Path) -> tuple[list[dict[str, Any]], str]:
 
 @dataclass(frozen=True)
 class ErrorHistory:
-    """One parameter's recorded root mean square error; arrays of equal length.
-
-    Attributes:
-        records: indices into the history's records, ascending.
-        values: >= 0; infinite if the record has no number.
-    """
+    """One parameter's recorded error, infinite where a record has no number, and the ascending indices of these records in the history."""
 
     records: np.ndarray
     values: np.ndarray
@@ -193,11 +188,7 @@ class History:
 
 @dataclass
 class HistoryReader:
-    """Reader of a history that may still grow. A file that was replaced or truncated is read from the start.
-
-    Attributes:
-        folder: run folder that must contain it.
-    """
+    """Reader of a history in a run folder that may still grow. A file that was replaced or truncated is read from the start."""
 
     path: Path
     folder: Path
@@ -212,13 +203,9 @@ class HistoryReader:
         self._reset()
 
     def read(self, to_the_end: bool = True) -> History:
-        """Return the current contents of the file.
+        """Return the current contents of the file, `to_the_end` with a last line that a running process may still be writing.
 
-        Args:
-            to_the_end: whether to include a last line without a line break, which a running process may still be writing.
-
-        Raises:
-            InputError: the file is missing or too large, or a line is malformed; the message names file and line.
+        Raises `InputError`: the file is missing or too large, or a line is malformed; the message names file and line.
         """
         with bounded_files.open_regular(self.path, self.folder) as file:
             status = os.fstat(file.fileno())

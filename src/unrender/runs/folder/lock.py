@@ -35,13 +35,7 @@ _WITHIN_ONE_MACHINE = {"nolock", "local_lock=flock", "local_lock=all", "nobrl"}
 
 @dataclass(frozen=True)
 class Holder:
-    """A process.
-
-    Attributes:
-        pid: process id.
-        host: name of the machine.
-        started: boot id and start time, which distinguish it from another process with the same id.
-    """
+    """A process of a machine; boot id and start time distinguish it from another process with the same id."""
 
     pid: int
     host: str

@@ -35,12 +35,8 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 @dataclass(frozen=True)
 class Packed:
-    """A packed state.
-
-    Attributes:
-        skeleton: structure of the state as JSON, in which arrays are numbered.
-        tensors: {number as text: array}, on the host; on a CPU they share the state's memory.
-    """
+    """A packed state: its structure as JSON, in which arrays are numbered, and {number as text: array} on the host, which may share its
+    memory."""
 
     skeleton: Any
     tensors: dict[str, np.ndarray]

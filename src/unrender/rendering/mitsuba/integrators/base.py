@@ -44,12 +44,7 @@ def remap(table: UInt32, pointer: Pointer) -> Pointer:
 
 
 class StatePointers:
-    """Objects of each traced state: of the current scene or, for a pair, of the current and of the previous one.
-
-    Args:
-        tables: `ScenePair.tables()`; used for a pair only.
-        pair: whether the previous state is traced too.
-    """
+    """Objects of each traced state: of the current scene or, for a pair, of the current and of the previous one by `ScenePair.tables()`."""
 
     def __init__(self, tables: Mapping[str, Any], pair: bool):
         self._tables = tables
@@ -116,17 +111,10 @@ class PathKernel(Protocol):
     def sample(
         self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, Spectrum | None]:
-        """Trace one path per lane. Call under `dr.suspend_grad()`.
+        """Trace one path per lane of camera rays. Call under `dr.suspend_grad()`. The same seed of the sampler replays the same paths.
 
-        Args:
-            context: constant inputs of the paths.
-            sampler: seeded; the same seed replays the same paths.
-            ray: camera rays.
-            active: lanes that are traced. A replay omits the samples that the primal pass dropped.
-
-        Returns:
-            radiance per lane of the current and, for a pair, of the previous state, both unbiased; in `Forward` mode the derivative of
-            the radiance along the tangents, and None.
+        Returns the radiance per lane of the current and, for a pair, of the previous state, both unbiased; in `Forward` mode the derivative
+        of the radiance along the tangents, and None. A replay omits the samples that the primal pass dropped.
         """
         ...
 

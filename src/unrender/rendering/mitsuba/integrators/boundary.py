@@ -54,13 +54,7 @@ _EMITTER_POINTS, _PAIRS = 256, 1 << 20
 
 
 class BoundaryIntegrator:
-    """Boundary derivatives of a perspective sensor's image.
-
-    Args:
-        table: the scene's edges.
-        max_depth: maximum path length in segments, >= 1; 1 for AOVs.
-        aov: property whose jumps at edges count in place of radiance; None for radiance.
-    """
+    """Boundary derivatives of a perspective sensor's image, or of an AOV with a maximum depth of 1, from the jumps at the scene's edges."""
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, table: EdgeTable, max_depth: int, aov: AovKernel | None = None):
@@ -70,13 +64,8 @@ class BoundaryIntegrator:
     def weighted_image(self, scene: Any, sensor: Any, weights: Any, seed: int, samples: int) -> Any:
         """Return a value whose derivative equals the boundary term of Σ weights · image, attached to the meshes' positions.
 
-        It is unbiased up to the edges that the module omits, silhouettes of shapes that are not meshes, and the offset `OFFSET`.
-
-        Args:
-            scene, sensor: Mitsuba's scene, and a perspective sensor.
-            weights: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image.
-            seed: in [0, 2**32).
-            samples: number of samples of each part.
+        It is unbiased up to the edges that the module omits, silhouettes of shapes that are not meshes, and the offset `OFFSET`. It takes
+        `samples` of each part, of a seed in [0, 2**32).
         """
         return self._collected(WeightedPicture(scene, sensor, weights, samples), seed)
 
@@ -198,14 +187,10 @@ class BoundaryIntegrator:
     def _draw(
         self, picture: Picture, positions: Any, seed: int, most: int, emitters: Any = None
     ) -> tuple[Any, Any, BoundarySegment, EyePath, Any]:
-        """Sample edges, by length and solid angle of their directions, a point of each and a direction.
+        """Sample edges, by length and solid angle of their directions, a point of each and a direction; `most` vertices between x_a and the
+        sensor.
 
-        Args:
-            most: maximum number of vertices between x_a and the sensor.
-            emitters: registry ids by edge; edges of id 0 are left out. None for all edges.
-
-        Returns:
-            indices of edges, attached points, segments, eye paths, and the reciprocal of the density.
+        Edges of emitter id 0 are left out. Returns indices of edges, attached points, segments, eye paths, and the reciprocal density.
         """
         table, count = self._table, picture.samples
         with dr.suspend_grad():

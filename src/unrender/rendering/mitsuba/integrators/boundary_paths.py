@@ -64,26 +64,17 @@ class Picture:
         return mi.Vector2f(x - uv.x * change, y - uv.y * change) / w
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
-        """Add samples, whose contribution to their pixels' derivatives is value times the derivative of motion.
+        """Add samples, whose contribution to their pixels' derivatives is value (detached, over the density) times the derivative of
+        motion.
 
-        Args:
-            value: `mi.Spectrum`, detached, over the density of the sample.
-            position: on the film, in pixels.
-            active: lanes that contribute.
-            motion: `mi.Float`, attached to the meshes' positions.
-
-        Returns:
-            `mi.Float` of width 1, attached to the positions if the picture is for backward mode. Callers add the returned values.
+        The position is on the film, in pixels, and `motion` is attached to the meshes' positions. Returns `mi.Float` of width 1, attached
+        to the positions in backward mode. Callers add the returned values.
         """
         raise NotImplementedError
 
 
 class WeightedPicture(Picture):
-    """Picture for backward mode, which sums all pixels times their weights.
-
-    Args:
-        weights: `mi.TensorXf` (H, W, 3).
-    """
+    """Picture for backward mode, which sums all pixels times their weights (H, W, 3)."""
 
     def __init__(self, scene: Any, sensor: Any, weights: Any, samples: int):
         super().__init__(scene, sensor, samples)
@@ -163,15 +154,9 @@ class BoundarySegment:
 
 
 class EyePath:
-    """Subpath from x_a, behind an edge point, to the sensor, with a random number of intermediate vertices.
+    """Subpath from x_a, behind an edge point, to the sensor: `bounces` intermediate vertices, a random number, and one more segment.
 
-    Attributes:
-        first: x_a, `mi.SurfaceInteraction3f`.
-        moved: x_a as hit by a ray from the sensor's side; attached.
-        throughput: importance over density.
-        position: on the film in pixels.
-        bounces: number of intermediate vertices; there are `bounces` + 1 segments before x_a.
-        active: whether it reaches the sensor.
+    `moved` is x_a as hit by a ray from the sensor's side, attached. The throughput is importance over density.
     """
 
     def __init__(self, picture: Picture, segment: BoundarySegment, sampler: Any, most: int, active: Any):

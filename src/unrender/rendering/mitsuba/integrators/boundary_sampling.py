@@ -79,16 +79,7 @@ def coplanar(edge: EdgePoints) -> Any:
 
 
 class EmitterPoints:
-    """Points on emitters and directions to distant ones, the same number on each emitter.
-
-    Args:
-        scene: the Mitsuba scene, which has emitters.
-        count: number of points of all emitters; each has at least one.
-        time: time of the picture, `mi.Float`.
-
-    Attributes:
-        count: actual number of points.
-    """
+    """Points on emitters of a scene and directions to distant ones, the same number on each emitter, at least one; `count` in all."""
 
     def __init__(self, scene: Any, seed: int, count: int, time: Any):
         self._time = time

@@ -38,14 +38,7 @@ _CURVES = {"Sphere": (_SPHERE,), "Disk": (_CIRCLE,), "Cylinder": (_CIRCLE, _TOP,
 
 
 class SilhouetteCurves:
-    """Silhouette curves of a scene that does not move, in pieces: of meshes, spheres, disks and cylinders.
-
-    Args:
-        scene: the Mitsuba scene.
-
-    Attributes:
-        count: number of pieces.
-    """
+    """Silhouette curves of a scene that does not move, in `count` pieces: of meshes, spheres, disks and cylinders."""
 
     @staticmethod
     def omitted(scene: Any) -> list[str]:
@@ -175,13 +168,8 @@ class _FilmMap:
 
 
 class CameraMotion:
-    """Derivatives of a perspective sensor's image by its own pose and field of view.
-
-    Args:
-        table: the scene's edges; None if the sensor's position does not change.
-        max_depth: maximum path length in segments, >= 1.
-        still: whether no shape moves, so that curves and mirrors are computed only once.
-    """
+    """Derivatives of a perspective sensor's image by its own pose and field of view; `table` is None if its position does not change. If
+    the scene is `still`, curves and mirrors are computed only once."""
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, table: EdgeTable | None, max_depth: int, still: bool):
@@ -195,11 +183,6 @@ class CameraMotion:
         """Return a value whose derivative equals that of Σ weights · image, attached to the sensor's parameters.
 
         It is unbiased, except for the views through curved mirrors and glass if the sensor's position changes.
-
-        Args:
-            scene, sensor: Mitsuba's scene, and a perspective sensor.
-            view: weights of the sensor's pixels.
-            seed: in [0, 2**32).
         """
         if self._mirrors is None or not self._still:
             self._mirrors = FlatMirrors(scene)

@@ -41,15 +41,8 @@ DISTRIBUTIONS: dict[str, tuple[int, NormalDistribution]] = {"ggx": (1, GGX()), "
 
 @dataclass
 class BranchVertex:
-    """Vertex where the pair of paths branches off. It is state of Dr.Jit loops.
-
-    Attributes:
-        ray: ray that hits the vertex.
-        depth: number of segments before it.
-        β: throughput up to it.
-        η: relative index of refraction up to it.
-        valid: lanes that have such a vertex.
-    """
+    """Vertex where the pair of paths branches off, in `valid` lanes: the ray that hits it, with the number of segments, the throughput and
+    the relative index of refraction before it. It is state of Dr.Jit loops."""
 
     ray: mi.Ray3f
     depth: UInt32
@@ -75,17 +68,10 @@ class BranchVertex:
 
 
 class RoughLobe:
-    """Reflection at one vertex, in lanes that use differential sampling.
+    """Reflection at one vertex, in lanes that use differential sampling (`served`); `moved` is α minus itself: 0, with its derivative.
 
-    Args:
-        distributions: distributions of the scene, by their entry in the table.
-        kind: the BSDF's entry in the table, per lane; 0 in lanes that use standard sampling.
-        α: its roughness, attached if the caller resumes gradients.
-        wi: direction towards the previous vertex in the local frame; below the surface on the back side of a two-sided BSDF.
-
-    Attributes:
-        served: lanes that use differential sampling.
-        moved: α minus itself: 0, with its derivative.
+    `kind` is the BSDF's entry in the table of distributions, 0 in other lanes. `wi` is the direction towards the previous vertex in the
+    local frame; below the surface on the back side of a two-sided BSDF.
     """
 
     def __init__(self, distributions: Mapping[int, NormalDistribution], kind: UInt32, α: Float, wi: mi.Vector3f):
@@ -154,11 +140,7 @@ class RoughLobe:
 
 
 class DifferentialBsdf:
-    """The two steps of differential sampling: omission of D's derivative in the replay, and the pair of paths that estimates it.
-
-    Args:
-        kinds: names of the distributions of the scene, see `DISTRIBUTIONS`.
-    """
+    """The two steps of differential sampling: omission of D's derivative in the replay, and the pair of paths that estimates it."""
 
     def __init__(self, kinds: Iterable[str]):
         # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the path tracer's loop.
@@ -181,14 +163,10 @@ class DifferentialBsdf:
         numbers: Any,
         incident: Callable[[BranchVertex, ScatteringVertex, mi.Ray3f, Any, Bool], Spectrum],
     ) -> Spectrum:
-        """Return 0, with the derivative of each path's radiance that the replay has omitted.
+        """Return 0, with the derivative of each path's radiance that the replay has omitted, by `numbers` that the path has not used.
 
-        Args:
-            context: context of the replay.
-            branch: vertex where the pair branches off.
-            numbers: sampler whose numbers the path has not used.
-            incident: radiance along a ray that leaves the vertex, a function of (branch, vertex with the direction's density, ray, sampler,
-                active). It applies the MIS weight to emitters that the ray hits.
+        `incident` is the radiance along a ray that leaves the vertex, a function of (branch, vertex with the direction's density, ray,
+        sampler, active). It applies the MIS weight to emitters that the ray hits.
         """
         geometry: Any = context.geometry
         si = geometry.ray_intersect(branch.ray, ray_flags=mi.RayFlags.All, coherent=False, active=branch.valid)

@@ -70,14 +70,7 @@ class Reservoir:
 
 @dataclass
 class DifferentialRatioTracking:
-    """Loop state of `update_reservoir`.
-
-    Attributes:
-        dda: position on the segment.
-        β: throughput of each state up to this position, including ratio-tracked transmittance.
-        reservoir: reservoir of the path.
-        active: lanes that are still tracking.
-    """
+    """Loop state of `update_reservoir`; β are throughputs up to this position, including ratio-tracked transmittance."""
 
     dda: DdaState
     β: list[Spectrum]
@@ -154,15 +147,10 @@ def _offer_point(
 
 
 def relative_derivatives(segment: MediumSegment, t: Float, collides: Bool, noise: Any, inside: Bool) -> list[Spectrum]:
-    """Return, for each state, the derivative of a path's contribution by the medium of a segment, relative to the contribution
-    (attached; only the derivative is meaningful).
+    """Return, for each state, the derivative of a path's contribution by the medium of a segment, relative to the contribution (attached;
+    only the derivative is meaningful).
 
-    Args:
-        segment: segment inside the medium.
-        t: distance where the segment ends, if it `collides`.
-        collides: lanes with a real collision.
-        noise: random numbers independent of those of the path.
-        inside: lanes inside the medium.
+    `t` is where the segment ends, in lanes with a real collision (`collides`). The `noise` is independent of the path.
     """
     length = dr.select(collides, t, segment.far) - segment.near
     # Light leaves an unbounded medium only in channels without extinction. Its attenuation has an infinite derivative, left out here.

@@ -101,11 +101,8 @@ def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
-    """Sample a point on an emitter without a visibility test, with the probabilities in `tables` or else the scene's own.
-
-    Returns:
-        the direction sample, and its radiance over its density.
-    """
+    """Return a direction sample to an emitter without a visibility test, and its radiance over its density, with the probabilities in
+    `tables` or else the scene's own."""
     if "emitter_cdf" not in context.tables:
         return context.scene.sample_emitter_direction(vertex, sample, False, active)
     cdf, count = context.tables["emitter_cdf"], len(context.scene.emitters())
@@ -140,15 +137,11 @@ def has_sun(emitters: Iterable[mi.Emitter]) -> bool:
 def inside_sun(
     ds: Any, sample: mi.Point2f, density: Float, draw: Callable[[mi.Point2f, Bool], Any]
 ) -> tuple[mi.Vector3f, Bool]:
-    """Return the directions of a sample, with those at the edge of the sun moved inside it, and the lanes of these.
+    """Return the directions of a sample, with those at the edge of the sun moved inside it by other random numbers (`draw`), and the lanes
+    of these.
 
     In single precision the cosine of the sun's angular radius differs from 1 by 180 roundings only. Mitsuba therefore draws 0.4 % of the
     sun's directions so close to its edge that `eval_direction` and `pdf_direction` take them for directions beside the sun.
-
-    Args:
-        ds: direction sample of the random numbers `sample`.
-        density: value of `pdf_direction` for `ds`.
-        draw: function that returns the direction sample of other random numbers, in some lanes.
     """
     edge = ~ds.delta & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite) & (density < 0.5 * ds.pdf)
     # These random numbers draw another point of the same disk. A chord of the disk lies inside it.
@@ -172,14 +165,7 @@ def direct_emission(
     β: Sequence[Spectrum],
     active: Bool,
 ) -> list[Spectrum]:
-    """Return Le of each state: the weighted emission of the surface (or the environment) that BSDF sampling hit.
-
-    Args:
-        last: last scattering vertex of the path.
-        surfaces: the interaction on the shape of each state.
-        β: throughput of each state.
-        active: lanes that hit a surface or leave the scene.
-    """
+    """Return Le of each state: the weighted emission of the surface (or the environment) that BSDF sampling hit from the `last` vertex."""
     emitter, mis = met_emitter(context, last, surfaces[0], active)
     emitters = context.states.emitters(emitter)
     with context.resume_grad():
@@ -190,15 +176,9 @@ def direct_emission(
 
 
 class EmitterConnection:
-    """A point sampled on an emitter for next-event estimation at a vertex.
+    """A point sampled on an emitter for next-event estimation at a vertex. The caller removes occluded lanes from `active`.
 
-    Args:
-        context, vertex, sample, active: the path, where the connection begins, random numbers, lanes.
-        turning: whether the radiance of an environment has derivatives with respect to its rotation.
-
-    Attributes:
-        ds: `mi.DirectionSample3f`.
-        active: lanes with a sampled emitter; the caller removes occluded ones.
+    With `turning`, the radiance of an environment has derivatives with respect to its rotation.
     """
 
     def __init__(
@@ -242,12 +222,10 @@ class EmitterConnection:
         return radiance if self._factor is None else radiance * self._factor
 
     def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
-        """Return Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached if the caller resumes gradients.
+        """Return Ld of each state: throughput with transmittance, value of BSDF (times cosine) or phase function, emitted radiance and MIS
+        weight.
 
-        Args:
-            β: throughput of each state, including transmittance.
-            values: value of each state's BSDF (times cosine) or phase function towards the emitter.
-            pdf: solid angle density with which the current state's BSDF or phase function samples that direction.
+        Attached if the caller resumes gradients. `pdf` is the solid angle density of the current state's BSDF or phase function.
         """
         ds = self.ds
         inv_pdf = dr.select(self.active, dr.rcp(ds.pdf), 0)

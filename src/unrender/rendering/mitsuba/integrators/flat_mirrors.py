@@ -21,14 +21,8 @@ _PLANES = 12
 
 
 class FlatMirrors:
-    """The flat mirrors of a scene. False if there are none.
-
-    Args:
-        scene: the Mitsuba scene.
-
-    Attributes:
-        count: number of views: index 0 without a mirror, and one for each mirror plane.
-    """
+    """The flat mirrors of a scene, False if there are none. It has `count` views: index 0 without a mirror, and one for each mirror
+    plane."""
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, scene: Any):
@@ -155,14 +149,7 @@ def glossy_radiance(
     """Return 0, with the derivative of the reflected radiance by the direction of view, without perfectly specular lobes.
 
     The result is the radiance minus itself at the detached direction. Derivatives by the material, which path replay includes, cancel.
-
-    Args:
-        scene: the Mitsuba scene.
-        si: detached interaction at the visible point.
-        towards: direction of view in the frame of `si`, attached.
-        sampler: sampler of the lanes.
-        trace: radiance along a ray that hits an interaction, a function of (scene, ray, interaction, sampler, active).
-        active: lanes that contribute.
+    `towards` is the direction in the frame of `si`, attached, and `trace` the radiance along a ray that hits an interaction.
     """
     context = mi.BSDFContext()
     with dr.suspend_grad():

@@ -91,14 +91,7 @@ class MajorantSupergrids:
 
 
 class MajorantSupergrid:
-    """Majorant supergrid of one medium.
-
-    Attributes:
-        voxels: number of extinction voxels along x, y and z.
-        cells: number of cells along x, y and z.
-        to_cells: (3, 4), affine, from the world to cells.
-        size: size of its `majorants`.
-    """
+    """Majorant supergrid of one medium: extinction voxels and cells along x, y and z, and the affine map (3, 4) from the world to cells."""
 
     def __init__(self, parameters: Any, to_local: np.ndarray, scale: float):
         self._parameters = parameters
@@ -264,15 +257,7 @@ class HomogeneousMajorant:
 
 
 class SupergridTraversal:
-    """Traversal of the cells along a segment, with the interface of `HomogeneousMajorant`.
-
-    Args:
-        tables: {"frames", "layout", "majorants"} of `MajorantSupergrids`.
-        medium: `mi.MediumPtr` of the scene of the tables.
-        ray, near, far: the segment.
-        σ̄: majorant of media without a grid; None if all have one.
-        active: lanes inside a medium.
-    """
+    """Traversal of the cells along a segment, with the interface of `HomogeneousMajorant`; σ̄ is the majorant of media without a grid."""
 
     def __init__(self, tables: Any, medium: Any, ray: Any, near: Any, far: Any, σ̄: Any, active: Any):
         number: Any = dr.reinterpret_array(mi.UInt32, medium)

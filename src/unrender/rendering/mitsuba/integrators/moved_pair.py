@@ -233,15 +233,10 @@ class MovedPair:
         path: PairState,
         followed: Bool,
     ) -> Continuation:
-        """Return the next segment of the previous state's path: in its own direction, or a reconnection to the current path's next vertex.
+        """Return the next segment of the previous state's path: in its own direction, or a reconnection to the current path's next vertex
+        (`pi`).
 
-        Args:
-            scenes, tables: of `sample`.
-            out: sampled directions of both paths.
-            pi: the current path's next vertex, of the lanes `followed`.
-            share, reconnected: probability of a reconnection, and lanes that chose it.
-            path: state before the segment.
-            followed: lanes whose current path has a next vertex.
+        `share` is the probability of a reconnection, and `followed` the lanes whose current path has a next vertex.
         """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
         same, own = path.same, before.active & ~reconnected

@@ -38,13 +38,8 @@ _MARGIN = 1.01
 
 
 def bounding_ellipsoids(meshes: Sequence[Sequence[Any]]) -> Float:
-    """Return the centre and the inverse half axes of an ellipsoid around each bounding box, 6 numbers each, `mi.Float`.
-
-    The ellipsoids contain all points.
-
-    Args:
-        meshes: for each ellipsoid, flat arrays of the positions that it contains.
-    """
+    """Return the centre and the inverse half axes of an ellipsoid around each box of flat arrays of positions, all of which it contains: 6
+    numbers each."""
     values = []
     for parts in meshes:
         points = dr.unravel(mi.Point3f, dr.concat([mi.Float(part) for part in parts]))
@@ -58,11 +53,7 @@ def bounding_ellipsoids(meshes: Sequence[Sequence[Any]]) -> Float:
 
 
 class BoundingEllipsoids:
-    """Ellipsoids in a kernel. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
-
-    Args:
-        numbers: result of `bounding_ellipsoids`, an array in memory.
-    """
+    """Ellipsoids of `bounding_ellipsoids` in a kernel. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state."""
 
     def __init__(self, numbers: Float):
         # Gather once, before the loop over a path's vertices.
@@ -82,17 +73,8 @@ class BoundingEllipsoids:
 
 @dataclass
 class PathState:
-    """Path of one state. It is state of a Dr.Jit loop, hence mutable.
-
-    Attributes:
-        L: radiance accumulated so far.
-        β: throughput.
-        η: relative index of refraction.
-        ray: ray that leads to the vertex.
-        pi: preliminary intersection there; not valid for rays without an intersection.
-        last: the previous scattering vertex.
-        active: lanes whose path continues.
-    """
+    """Path of one state: the ray that leads to the vertex, the preliminary intersection there (not valid for rays without one), the last
+    scattering vertex, radiance L so far, throughput β and relative index of refraction η. It is state of a Dr.Jit loop, hence mutable."""
 
     L: Spectrum
     β: Spectrum
@@ -125,15 +107,8 @@ class PairState:
 
 @dataclass(frozen=True)
 class Vertex:
-    """Vertex of one state's path.
-
-    Attributes:
-        si, bsdf: surface interaction and BSDF.
-        Le: emission there, times throughput.
-        Ld: contribution of the sampled emitter point `to`, times throughput, if it is visible.
-        to: sampled point on an emitter.
-        active: lanes whose path may continue.
-    """
+    """Vertex of one state's path; emission there and the contribution of the sampled emitter point `to`, if visible, both times throughput.
+    `active` are lanes whose path may continue."""
 
     si: Any
     bsdf: Any
@@ -165,16 +140,8 @@ class Direction:
 
 @dataclass(frozen=True)
 class Continuation:
-    """Next segment of the previous state's path.
-
-    Attributes:
-        ray, pi: ray to the next vertex, and the preliminary intersection there.
-        weight: weight of the direction, 0 if the vertex cannot be reached.
-        pdf: solid angle density with which BSDF sampling alone samples that direction.
-        delta: lanes whose direction is perfectly specular.
-        η: relative index of refraction of the segment.
-        same: lanes whose next vertex is that of the current state's path, see `PairState`.
-    """
+    """Next segment of the previous state's path, of weight 0 if its vertex cannot be reached; `pdf` is the solid angle density of BSDF
+    sampling alone. `same` are lanes whose next vertex is that of the current state's path, see `PairState`."""
 
     ray: mi.Ray3f
     pi: mi.PreliminaryIntersection3f
@@ -260,20 +227,11 @@ def follow(
     same: Bool,
     coherent: bool = False,
 ) -> tuple[Any, Bool]:
-    """Intersect the previous state's ray. Rays that equal the current state's ray, without moving shapes nearby, reuse its hit.
+    """Intersect the previous state's ray. Rays that equal the current state's ray, without moving shapes nearby (`clear`), reuse its hit
+    `pi`.
 
-    Args:
-        sceneₚ: the previous scene.
-        tables: of `MovedPair.sample`.
-        rays: rays of both states.
-        pi: hit of the current state's ray.
-        clear: see `is_clear`.
-        active: lanes whose ray is traced.
-        same: lanes whose rays begin at one point, and whose `pi` is known.
-        coherent: whether neighbouring rays are similar.
-
-    Returns:
-        the hit, and lanes in which both rays hit the same point of a static shape, or nothing.
+    `same` are lanes whose rays begin at one point, and whose `pi` is known; `coherent` tells that neighbouring rays are similar. Returns
+    the hit, and lanes in which both rays hit the same point of a static shape, or nothing.
     """
     ray, rayₚ = rays
     equal = same & dr.all((ray.o == rayₚ.o) & (ray.d == rayₚ.d))

@@ -41,17 +41,8 @@ without the previous state. The floor keeps paths that only the previous state n
 class PathState:
     """Loop state of a path.
 
-    Attributes:
-        ray: ray of the next segment.
-        depth: number of segments traced.
-        L: radiance of each state: accumulated so far or, in a replay, remaining.
-        δL: derivative of the radiance along the tangents (forward mode).
-        δlogβ: derivative of the logarithm of the throughput, if connections are recorded.
-        β: throughput of each state.
-        η: relative index of refraction.
-        last: vertex that `ray` leaves.
-        active: lanes whose path continues.
-        branches: vertex of the differential paths, if there are any; else empty.
+    L is the radiance of each state: accumulated so far or, in a replay, remaining. In forward mode, δL is its derivative along the
+    tangents, and δlogβ that of the logarithm of the throughput, if connections are recorded.
     """
 
     ray: mi.Ray3f
@@ -67,14 +58,10 @@ class PathState:
 
 
 class BsdfDirection:
-    """A direction sampled from a BSDF.
+    """A direction sampled from a BSDF, with the solid angle density of all smooth lobes together.
 
-    Attributes:
-        bs: `mi.BSDFSample3f`.
-        pdf: solid angle density of all smooth lobes together.
-        delta: lanes that sampled a perfectly specular lobe.
-        values: for each state, BSDF times cosine, or value of the specular lobe if it depends on parameters; attached.
-        weights: for each state, sampling weights; detached.
+    For each state, `values` are BSDF times cosine, or the value of a specular lobe that depends on parameters, attached; `weights` are
+    detached.
     """
 
     def __init__(self, bs: mi.BSDFSample3f, pdf: Float, delta: Bool, values: list[Spectrum], weights: list[Spectrum]):

@@ -19,16 +19,7 @@ their value (conductor, dielectric, plastic); by the opacity of a mask."""
 
 
 class DeltaLobes:
-    """Perfectly specular lobes that were sampled at one path vertex.
-
-    Args:
-        tables: its "delta" entry is used.
-        bsdf: sampled BSDF of the current state.
-        bs: the sampled directions.
-        samples: the random numbers (1D, 2D) of the samples.
-        active: lanes where `bsdf` was sampled.
-        delta: lanes where it sampled a perfectly specular lobe.
-    """
+    """Perfectly specular lobes that were sampled at one path vertex by random numbers (1D, 2D), in lanes `delta`; by `tables["delta"]`."""
 
     def __init__(
         self,
@@ -97,17 +88,9 @@ def sampling_weights(
 ) -> list[Spectrum]:
     """Return the sampling weight of each state for a direction that the current state sampled.
 
-    It is the BSDF's total value over its total density, which both states share, or the sampled lobe's own weight if it is perfectly
-    specular.
-
-    Args:
-        values: value of each state's BSDF (times cosine) or phase function, in the sampled direction.
-        pdf: solid angle density of that direction.
-        weight: the weight that the BSDF gave its sample. It is used where the lobe is perfectly specular. Where it is 0, although value
-            and density are not, and the BSDF gave the whole density, the direction was rejected, and its weight is 0 in all states.
-        smooth: lanes whose direction has a density.
-        delta: lanes that sampled a perfectly specular lobe.
-        own_pdf: the density that the BSDF gave its sample: of all lobes, or of the sampled one.
+    It is the BSDF's total value over its total density `pdf`, which both states share, or the sampled lobe's own `weight` if it is
+    perfectly specular. Where that is 0, although value and density are not, and the BSDF gave the whole density (`own_pdf`), the direction
+    was rejected, and its weight is 0 in all states.
     """
     full_density = dr.abs(own_pdf - pdf) <= _SAME_DENSITY * pdf
     rejected = full_density & (dr.max(weight) <= 0) & (dr.max(dr.detach(values[0])) > 0)

@@ -103,14 +103,7 @@ def sample_optical_depth(u: Float) -> Float:
 
 @dataclass
 class FreeFlight:
-    """Loop state of `sample_free_flight`, and its result.
-
-    Attributes:
-        dda: position on the segment.
-        β: throughput of each state.
-        collides: whether the collision at `dda.t` is real.
-        active: lanes without a real collision so far.
-    """
+    """Loop state of `sample_free_flight`, and its result: whether the collision at `dda.t` is real, and the throughput of each state."""
 
     dda: DdaState
     β: list[Spectrum]
@@ -124,11 +117,8 @@ def sample_free_flight(
 ) -> tuple[Float, Bool, list[Spectrum]]:
     """Sample a collision on a segment: in closed form for homogeneous media, else by delta tracking.
 
-    The probability of a real collision weights all channels of all states by their throughput. The sum of all throughputs is then
-    constant, so none of them diverges.
-
-    Returns:
-        distance of the real collision, whether there is one, and the throughputs, including σₛ over the density.
+    The probability of a real collision weights all channels of all states by their throughput. The sum of all throughputs is then constant,
+    so none of them diverges. Returns the distance, whether there is one, and the throughputs, including σₛ over the density.
     """
     flying = active & (segment.near < segment.far)
     closed = flying & segment.media[0].is_homogeneous()
@@ -192,13 +182,7 @@ def _tentative_collision(segment: MediumSegment, flight: FreeFlight, sampler: An
 
 @dataclass
 class RatioTracking:
-    """Loop state of `estimate_transmittance`.
-
-    Attributes:
-        dda: position on the segment.
-        T: transmittance of each state up to this position.
-        active: lanes that are still tracking.
-    """
+    """Loop state of `estimate_transmittance`: the transmittance of each state up to a position on the segment."""
 
     dda: DdaState
     T: list[Spectrum]

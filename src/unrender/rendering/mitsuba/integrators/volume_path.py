@@ -24,15 +24,7 @@ from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 
 
 class PathStart:
-    """Start of paths: on rays, or at distance `t` along rays in a medium, where they scatter first.
-
-    Attributes:
-        ray: `mi.Ray3f`.
-        medium: medium at its origin.
-        depth: depth of the path before it.
-        active: lanes that have a path.
-        t: distance of the first scattering event, or None.
-    """
+    """Start of paths: on rays, or at distance `t` along rays in a medium, where they scatter first."""
 
     def __init__(self, ray: mi.Ray3f, medium: mi.MediumPtr, depth: UInt32, active: Bool, t: Float | None = None):
         self.ray, self.medium, self.depth, self.active, self.t = ray, medium, depth, active, t
@@ -40,20 +32,10 @@ class PathStart:
 
 @dataclass
 class VolumePathState:
-    """Loop state of a path.
+    """Loop state of a path: ray and medium of the next segment, number of vertices so far, and last vertex.
 
-    Attributes:
-        ray: ray of the next segment.
-        medium: medium of the next segment.
-        depth: number of vertices so far.
-        L: radiance of each state: accumulated so far or, in a replay, remaining.
-        δL: derivative of the radiance along the tangents (forward mode).
-        β: throughput of each state.
-        η: relative index of refraction.
-        last: last vertex of the path.
-        reservoir: reservoir of differential ratio tracking.
-        forced: lanes whose first collision is `PathStart.t`.
-        active: lanes whose path continues.
+    L is the radiance of each state: accumulated so far or, in a replay, remaining; δL its derivative along the tangents. In lanes `forced`,
+    the first collision is `PathStart.t`.
     """
 
     ray: mi.Ray3f
@@ -85,16 +67,8 @@ class VolumeContext(PathContext):
 
 
 class Flight:
-    """A segment and its collision.
-
-    Attributes:
-        segment: part of the segment inside a medium.
-        t: distance of the collision.
-        collides: lanes that collide in the medium.
-        emits: lanes whose medium emits and does not scatter.
-        may_scatter: lanes whose depth allows another scattering event.
-        derivatives: for each state, the derivative of L by the medium (attached); () if it is not needed.
-    """
+    """A segment and its collision at `t`. In lanes `emits`, the medium emits and does not scatter. `derivatives` are of L by the medium,
+    for each state (attached); () if not needed."""
 
     def __init__(
         self,
@@ -110,16 +84,8 @@ class Flight:
 
 
 class Vertex:
-    """End of a segment, in a medium or on a surface.
-
-    Attributes:
-        mei, si: medium interaction and surface interaction.
-        interaction: the valid one of the two.
-        media, surfaces, bsdfs: the segment's medium, the surface interaction and the BSDF, of each state.
-        scatters: lanes that scatter in the medium.
-        meets: lanes that hit a surface and may continue.
-        may_scatter: lanes whose depth allows another scattering event.
-    """
+    """End of a segment, in a medium or on a surface, as the valid `interaction` of the two. Lanes `scatters` scatter in the medium, lanes
+    `meets` hit a surface and may continue."""
 
     def __init__(
         self,
@@ -153,16 +119,9 @@ class Vertex:
 
 
 class SampledDirection:
-    """Direction in which a path continues.
+    """Direction in which a path continues: of a BSDF sample, or `d` in media; `null` are specular lanes that continue straight.
 
-    Attributes:
-        bs: `mi.BSDFSample3f`, on surfaces.
-        d: world-space direction, in media.
-        pdf: solid angle density.
-        delta: lanes that sampled a perfectly specular lobe.
-        null: lanes among these that continue straight.
-        values: value of each state's BSDF, specular lobe or phase function; attached.
-        weights: sampling weight of each state; detached.
+    For each state, `values` are of BSDF, specular lobe or phase function, attached; `weights` are detached.
     """
 
     def __init__(
@@ -180,14 +139,8 @@ class SampledDirection:
 
 @dataclass
 class ConnectionSample:
-    """A point of a connection, uniform over its length inside media. It is state of a Dr.Jit loop, hence mutable.
-
-    Attributes:
-        ray: ray that the point lies on.
-        t: distance along the ray.
-        medium: medium at the point; null if the connection is outside all media.
-        length: length of the connection inside media.
-    """
+    """A point of a connection, uniform over its `length` inside media; its medium is null if that is 0. It is state of a Dr.Jit loop, hence
+    mutable."""
 
     ray: mi.Ray3f
     t: Float
@@ -216,15 +169,8 @@ class ConnectionSample:
 
 @dataclass
 class Connection:
-    """Loop state of `connect`, and its result.
-
-    Attributes:
-        ray: ray of the next segment.
-        medium: medium of the next segment.
-        T: transmittance of each state so far.
-        sample: see `connect`.
-        active: lanes that have not arrived.
-    """
+    """Loop state of `connect`, and its result: ray and medium of the next segment, transmittance of each state so far, and the sampled
+    point."""
 
     ray: mi.Ray3f
     medium: mi.MediumPtr

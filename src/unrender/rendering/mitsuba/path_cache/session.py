@@ -31,12 +31,7 @@ Objects = tuple[list[Any], list[Any]]
 
 
 class Evaluation:
-    """Evaluation of the sum of products that a cached path represents.
-
-    Args:
-        lookups: textures and emitters that depend on parameters.
-        depth: maximum path length in segments.
-    """
+    """Evaluation of the sum of products that a cached path of at most `depth` segments represents."""
 
     def __init__(self, lookups: Lookups, depth: int):
         self._areas, self._depth = lookups.areas, depth
@@ -49,13 +44,7 @@ class Evaluation:
     def backward(
         self, vertices: Vertices, states: Sequence[Objects], replay: Sequence[tuple[Any, Any]], spp: int, pixels: int
     ) -> None:
-        """Accumulate the gradients of the leaves.
-
-        Args:
-            vertices: cached paths.
-            replay: for each state, the film's weights and the result of `radiance`.
-            spp: samples per pixel.
-        """
+        """Accumulate the gradients of the leaves; `replay` has the film's weights and the result of `radiance` for each state."""
         finite = is_finite(*(radiance for _, radiance in replay))
         parts = [
             film.film_adjoint(weights, spp, pixels) * self._radiance(vertices, objects, finite)

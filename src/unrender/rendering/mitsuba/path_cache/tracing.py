@@ -50,19 +50,8 @@ _FIXED = ("sampling_weight", "to_world", "to_uv")
 
 
 class Lookups:
-    """Textures and emitters that depend on a set of parameters.
-
-    Args:
-        pair: both loads of the scene.
-        previous: whether to use the second load.
-
-    Attributes:
-        textures: reflectances of diffuse BSDFs.
-        emitters: area lights first, then environments.
-        areas: number of area lights.
-
-    Raises `InputError` with the reason for a parameter that is not supported.
-    """
+    """Textures (reflectances of diffuse BSDFs) and emitters (`areas` area lights, then environments) that depend on parameters, in one load
+    of the scene. Raises `InputError` with the reason for a parameter that is not supported."""
 
     def __init__(self, pair: ScenePair, keys: Sequence[str], previous: bool = False):
         if pair.volumetric:
@@ -209,14 +198,9 @@ class _Record:
 class TracePass(Pass):
     """Tracing of paths to cache: {name: flat array of `depth` concatenated rows}.
 
-    "surface" and "uv" are the index of the texture lookup at vertex r, from 1, 0 for none, and its texture coordinates. "light" is e_r
-    if no parameter changes an emitter. Otherwise e_r is stored for both `SOURCES`, "met" and "connected", each with the index of the
-    emitter lookup, and with its texture coordinates or the direction to it.
-
-    Args:
-        lookups: textures and emitters that depend on parameters.
-        depth: maximum path length in segments.
-        rr_depth: depth from which Russian roulette may terminate a path.
+    "surface" and "uv" are the index of the texture lookup at vertex r, from 1, 0 for none, and its texture coordinates. "light" is e_r if
+    no parameter changes an emitter. Otherwise e_r is stored for both `SOURCES`, "met" and "connected", each with the index of the emitter
+    lookup, and with its texture coordinates or the direction to it.
     """
 
     def __init__(self, lookups: Lookups, depth: int, rr_depth: int):
