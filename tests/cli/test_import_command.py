@@ -360,7 +360,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a cut mask": (lambda c: _cut(_mask(c)), "masks/view_2.png: cannot be read as a picture"),
     "a mask of other proportions": (lambda c: _save(_mask(c), np.full((10, 40), 255, np.uint8)), "other proportions"),
     "a missing mask": (lambda c: _mask(c).unlink(), "1 of 9 photographs have no mask, the first images/view_2.png"),
-    "no masks": (lambda c: shutil.rmtree(c / "masks"), "head: neither masks nor a mesh: give --masks D or --mesh M"),
+    "no masks": (
+        lambda c: shutil.rmtree(c / "masks"),
+        "head: neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N",
+    ),
     "no file": (lambda c: (c / "transforms.json").unlink(), "head: no camera poses: expected transforms.json"),
     "no JSON": (lambda c: (c / "transforms.json").write_text("{"), "transforms.json"),
     "no frames": (_top("frames", []), "transforms.json: frames: expected a list of at least one frame"),

@@ -115,6 +115,24 @@ def test_all_views_of_a_camera_follow_its_unknowns(cameras: int) -> None:
         assert (difference(images[0][view], images[1][view]) > 0.05) is (view < 1 or cameras == 1)
 
 
+def test_ids_with_dots_name_objects_of_files(tmp_path: Path) -> None:
+    """Programs name objects Cube.001, and photographs are cat.0.tga: such ids are no keys of Mitsuba's dictionaries."""
+    pictures = []
+    for dot in "_.":
+        (tmp_path / "scene.xml").write_text(
+            f"""<scene version="3.0.0"><sensor type="perspective" id="cat{dot}0"><film type="hdrfilm">
+            <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+            <shape type="cube" id="Cube{dot}001"><transform name="to_world"><translate z="6"/></transform></shape>
+            <emitter type="directional" id="sun{dot}1"><vector name="direction" x="0" y="0" z="1"/></emitter></scene>"""
+        )
+        parameters = [ur.Parameter(f"Cube{dot}001.translation.x", initial=0.3)]
+        views = [ur.View(np.zeros((8, 8, 3)), known={f"sun{dot}1.rotation": vector}) for vector in TURNS]
+        problem = ur.Problem(tmp_path / "scene.xml", parameters, views)
+        pictures.append([ur.render(problem, view=view, spp=16) for view in range(3)])
+    np.testing.assert_array_equal(*pictures)
+    assert np.min(np.mean(pictures, axis=(2, 3, 4))) > 0.01
+
+
 def test_an_expression_of_the_rotation_turns_the_light_as_described() -> None:
     """A view that knows what an expression sets is a world; the other view has the rotation of the expression."""
     views = [ur.View(np.zeros((8, 8, 3)), known={ROTATION: TURNS[0]}), ur.View(np.zeros((8, 8, 3)))]

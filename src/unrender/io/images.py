@@ -262,5 +262,7 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
 def _check_finite(values: np.ndarray) -> None:
     bad = ~np.isfinite(values).all(axis=-1)
     if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise InputError(f"{int(bad.sum())} pixels are NaN or infinite, the first in row {row}, column {column}")
+        (row, column), count = np.argwhere(bad)[0], int(bad.sum())
+        raise InputError(
+            f"{count} {'pixels are' if count > 1 else 'pixel is'} NaN or infinite, the first in row {row}, column {column}"
+        )

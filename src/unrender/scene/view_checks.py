@@ -162,9 +162,9 @@ def _is_of_film(source: Any) -> bool:
 def _check_not_negative(values: np.ndarray) -> None:
     bad = (values < _DARKEST * max(float(values.max()), 0.0)).any(axis=-1)
     if bad.any():
-        row, column = np.argwhere(bad)[0]
+        (row, column), count = np.argwhere(bad)[0], int(bad.sum())
         raise InputError(
-            f"{int(bad.sum())} pixels are negative, the first in row {row}, column {column}, but radiance is not; "
+            f"{count} {'pixels are' if count > 1 else 'pixel is'} negative, the first in row {row}, column {column}, but radiance is not; "
             "clip them at 0, or use the same reconstruction filter with negative lobes in the film"
         )
 

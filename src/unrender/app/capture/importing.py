@@ -322,11 +322,15 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     if unwrapped and (own_mesh is None or own_mesh.uv is None):
         meshes.check_atlas_installed()
     if own_mesh is None and not _has_masks(capture):
-        raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
+        raise InputError(
+            f"{folder}: neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N for a radiance field"
+        )
     views, notices = _views(capture, options)
     masked = all(views.masked)
     if own_mesh is None and not masked:
-        raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
+        raise InputError(
+            f"{folder}: neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N for a radiance field"
+        )
     training = views.of(held_out=False)
     with phases.phase("shape"):
         try:

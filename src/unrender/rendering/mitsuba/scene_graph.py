@@ -6,6 +6,7 @@ object's parameters affect the image, and each holder caches values that depend 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
@@ -350,8 +351,14 @@ def replace_meshes(scene: Any, meshes: Mapping[str, ReplacedMesh]) -> None:
 
 def scene_of(objects: Iterable[Any]) -> Any:
     """Return a scene of existing objects. Each keeps its id, which Mitsuba would otherwise take from the dictionary."""
+    listed = [*objects]
+    ids = [item.id() for item in listed]
+    free = (key for n in itertools.count() if (key := f"object_{n}") not in ids)
     named: dict[str, Any] = {"type": "scene"}
-    for index, item in enumerate(objects):
-        name = item.id()
-        named[name if name and name not in named else f"object_{index}"] = item
-    return mi.load_dict(named, parallel=False, optimize=False)
+    for name, item in zip(ids, listed, strict=True):  # an id in a file may have a dot, a key of a dictionary may not
+        named[next(free) if not name or "." in name or name in named else name] = item
+    scene = mi.load_dict(named, parallel=False, optimize=False)
+    for name, item in zip(ids, listed, strict=True):
+        if "." in name:
+            item.set_id(name)
+    return scene
