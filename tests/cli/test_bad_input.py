@@ -189,7 +189,7 @@ def _edit(name: str, old: str, new: str):
 
 
 SPOILT = [
-    (_nan, "problem.toml:8: views[0].reference: photo.exr: 1 pixels are NaN or infinite, the first in row 1, column 2"),
+    (_nan, "problem.toml:8: views[0].reference: photo.exr: 1 pixel is NaN or infinite, the first in row 1, column 2"),
     (
         _wrong_size,
         "problem.toml:8: views[0].reference: photo.exr: 4x6 pixels (width x height), but the sensor's film is 6x4",

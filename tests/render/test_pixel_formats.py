@@ -126,7 +126,7 @@ def test_other_channels_and_sizes_are_refused_in_one_line(
 def test_values_that_are_no_radiance_are_refused_in_one_line() -> None:
     for pixel_format, shape in (("rgb", (6, 6, 3)), ("xyz", (6, 6, 3)), ("luminance", (6, 6))):
         for bad, words in (
-            (np.nan, "1 pixels are NaN or infinite"),
+            (np.nan, "1 pixel is NaN or infinite"),
             (-0.5, "1 pixel is negative, the first in row 2"),
         ):
             reference = np.ones(shape)

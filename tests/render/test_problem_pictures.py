@@ -178,7 +178,7 @@ def test_refuses_folders_and_unknown_endings(tmp_path: Path):
 def test_names_the_first_pixel_that_is_not_finite(tmp_path: Path):
     broken = COLOURS.copy()
     broken[4, 5] = np.inf
-    with pytest.raises(InputError, match=r"a\.exr: 1 pixels are NaN or infinite, the first in row 4, column 5"):
+    with pytest.raises(InputError, match=r"a\.exr: 1 pixel is NaN or infinite, the first in row 4, column 5"):
         images.read(bitmap(broken, tmp_path / "a.exr"))
 
 

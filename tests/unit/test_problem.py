@@ -362,7 +362,7 @@ BAD_VIEWS = [
         r"reference: expected an array of shape \(H, W, 3\) with red, green and blue, or .*, got \(4, 5, 2\)",
     ),
     (View(np.zeros((0, WIDTH, 3))), r"reference: expected an array of shape \(H, W, 3\)"),
-    (View(nan_at(2, 3)), r"reference: 1 pixels are NaN or infinite, the first in row 2, column 3"),
+    (View(nan_at(2, 3)), r"reference: 1 pixel is NaN or infinite, the first in row 2, column 3"),
     (View(np.full((HEIGHT, WIDTH, 3), "a")), r"reference: expected an array of numbers"),
     (View(REFERENCE.astype(complex)), r"reference: expected an array of real numbers"),
     (View("nowhere.exr"), r"view 0: reference: nowhere.exr: no such file"),
