@@ -74,7 +74,7 @@ class Lenses(fields.Rendered):
             "camera": parts.camera((0, -1.9, 1.25), (0, -0.08, 0), 42.0, self.resolution),
             "screen": parts.rectangle((0, 0, 0), (1.5, 0, 0), (0, 1.5, 0), parts.diffuse(0.8)),
             "pane": meshes.triangles(
-                "pane", positions.reshape(-1, 3), meshes.height_faces(self.mesh_resolution), glass
+                "pane", positions.reshape(-1, 3), meshes.grid_faces(self.mesh_resolution, self.mesh_resolution), glass
             ),
             "back": parts.rectangle((0, 0, _PANE - 0.05), (-1, 0, 0), (0, 1, 0), glass),
             "lamp": parts.rectangle(
@@ -151,7 +151,7 @@ class Relief(fields.Rendered):
         """Return the scene with a height map (n, n), under one lamp or all."""
         positions = meshes.height_grid(self.height_resolution)
         positions[..., 2] = heights
-        corners = meshes.height_faces(self.height_resolution)
+        corners = meshes.grid_faces(self.height_resolution, self.height_resolution)
         lamps = {
             f"lamp_{n}": {
                 "type": "point",

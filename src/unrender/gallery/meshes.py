@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.rotations import rotation
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.description import load, load_described
+from unrender.scene.meshes import subdivided
 from unrender.scene.surfaces import Surface
 
 
@@ -60,9 +61,7 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
     for piece in pieces:
         rows, columns = piece.positions.shape[:2]
         v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
-        number = count + np.arange(rows * columns).reshape(rows, columns)
-        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-        faces += [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
+        faces.append(count + grid_faces(rows, columns))
         positions.append(piece.positions.reshape(-1, 3))
         coordinates.append(np.stack([u, v], -1).reshape(-1, 2) + np.array(piece.origin))
         normals.append(_normals(piece.positions, piece.closed).reshape(-1, 3))
@@ -95,9 +94,9 @@ def height_grid(count: int) -> np.ndarray:
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
-def height_faces(count: int) -> np.ndarray:
-    """Return its triangles, (2 (n - 1)², 3), whose front faces +z."""
-    number = np.arange(count * count).reshape(count, count)
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Return the triangles of a grid of vertices in row-major order, (2 (rows - 1) (columns - 1), 3); those of `height_grid` face +z."""
+    number = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
     return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
 
@@ -173,14 +172,9 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
     faces[inward] = faces[inward][:, ::-1]
     for _ in range(subdivisions):
-        # Every edge belongs to two triangles, which share its midpoint.
-        sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        edges, which = np.unique(sides, axis=0, return_inverse=True)
-        ab, bc, ca = which.reshape(3, -1) + len(points)
+        faces, edges = subdivided(faces, len(points))
         middles = points[edges].sum(axis=1)
         points = np.concatenate([points, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
-        a, b, c = faces.T
-        faces = np.concatenate([np.stack(t, -1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     return points, faces
 
 

@@ -15,7 +15,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels import uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
-from unrender.pixels.guided import GuidedOptions, GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
+from unrender.pixels.guided import GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
 from unrender.pixels.pixel_statistics import MapDenoiser, PixelStatistics
 from unrender.pixels.tiles import Tiles
 from unrender.scene.batches import PixelSample
@@ -111,9 +111,9 @@ class Adaptive(_Guided):
 
     def _sampler_for(self, problem: Problem) -> GuidedSampler:
         count = default_count(problem) if self.count is None else self.count
-        options = GuidedOptions(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
         rule = _GradientVariance(self.levels, self.learn_from_draws, self.by_cost, needs_second_moment=True)
-        return GuidedSampler("Adaptive", options, rule)
+        own = self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
+        return GuidedSampler("Adaptive", rule, count, *own)
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
@@ -173,7 +173,7 @@ class LossProportional(_Guided, PixelSampler):
     def _sampler_for(self, problem: Problem) -> GuidedSampler:
         del problem
         own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
-        return GuidedSampler("LossProportional", GuidedOptions(*own), _LossDerivative())
+        return GuidedSampler("LossProportional", _LossDerivative(), *own)
 
 
 @dataclass(frozen=True)

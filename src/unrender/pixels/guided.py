@@ -87,18 +87,6 @@ class GuidedSamplerState:
 
 
 @dataclass(frozen=True)
-class GuidedOptions:
-    """Options that the samplers with an importance map share; `Adaptive` documents them."""
-
-    count: int
-    refresh: int
-    samples: int | None
-    uniform: float | None
-    stratified: bool
-    denoiser: MapDenoiser
-
-
-@dataclass(frozen=True)
 class ImportanceRule(ABC):
     """Rule that distinguishes the samplers: which statistics they need, and how these become an importance map.
 
@@ -128,17 +116,20 @@ class ImportanceRule(ABC):
 class GuidedSampler:
     """Sampler of mini-batches in proportion to an importance map, mixed with uniform sampling.
 
-    Attributes:
-        options: options of the public sampler.
-        rule: rule that computes the importance map.
+    `owner` is the public sampler, and all but its rule are options that `Adaptive` documents.
     """
 
     owner: str
-    options: GuidedOptions
     rule: ImportanceRule
+    count: int
+    refresh: int
+    samples: int | None
+    uniform: float | None
+    stratified: bool
+    denoiser: MapDenoiser
 
     def init(self, problem: Problem) -> GuidedSamplerState:
-        check_batch(self.owner, problem, self.options.count)
+        check_batch(self.owner, problem, self.count)
         tiles = self._tiles(problem)
         uniform_table = InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array)
         ones = np.ones(len(tiles.views))
@@ -157,17 +148,17 @@ class GuidedSampler:
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
         traced, tangents = 0, {}
-        if not state.maps or state.age >= self.options.refresh:
+        if not state.maps or state.age >= self.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
         early = state.refreshes == 1 and state.age < _FIRST
-        if self.rule.learns and (early or state.age == self.options.refresh // 2):
+        if self.rule.learns and (early or state.age == self.refresh // 2):
             scales = pixel_statistics.scales(parameters, state.second_moment)
             tangents = pixel_statistics.random_tangents(problem, parameters, scales, key.fold(2))
         batch = replace(self.redraw(problem, state, key), samples=traced, tangents=tangents)
         return batch, replace(state, age=state.age + 1, since=state.since + 1)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        sample = state.table.draw(self.options.count, key.fold(1), self.options.stratified)
+        sample = state.table.draw(self.count, key.fold(1), self.stratified)
         maps = self._tiles(problem).split(state.shares.astype(np.float32))
         return MiniBatch(sample, probability=dict(enumerate(maps)))
 
@@ -182,8 +173,8 @@ class GuidedSampler:
 
     def _tiles(self, problem: Problem) -> Tiles:
         most = self._paths()
-        if self.options.samples is None and self.rule.learns:
-            most = max(most, min(_FEWEST_PATHS, _FIRST_PATHS * self.options.count))
+        if self.samples is None and self.rule.learns:
+            most = max(most, min(_FEWEST_PATHS, _FIRST_PATHS * self.count))
         return cut(problem, max(most, len(problem.views)))
 
     def _paths(self) -> int:
@@ -192,11 +183,10 @@ class GuidedSampler:
         It is `samples`, or a third of a mini-batch's pixels for each twenty steps between updates, but at least 4096, or twice the pixels
         of a small mini-batch. If there are more tiles than paths, only some updates trace paths.
         """
-        options = self.options
-        if options.samples is not None:
-            return options.samples
-        paths = min(max(options.count // 3, _FEWEST_PATHS), 2 * options.count)
-        return max(1, paths * options.refresh // 20)
+        if self.samples is not None:
+            return self.samples
+        paths = min(max(self.count // 3, _FEWEST_PATHS), 2 * self.count)
+        return max(1, paths * self.refresh // 20)
 
     def _update_importance_map(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
@@ -251,7 +241,7 @@ class GuidedSampler:
 
     def _with_probabilities(self, problem: Problem, tiles: Tiles, state: GuidedSamplerState) -> GuidedSamplerState:
         denoised = tuple(
-            np.maximum(denoise_map(tiles, values, self.options.denoiser, counts), 0.0)
+            np.maximum(denoise_map(tiles, values, self.denoiser, counts), 0.0)
             for values, counts in zip(state.maps[:FACTORS], state.counts[:FACTORS], strict=True)
         )
         density = self.rule.density(tiles, state.maps, denoised) / np.sqrt(state.costs)
@@ -260,7 +250,7 @@ class GuidedSampler:
             density = density * (float(tiles.sizes.sum()) / total)
         else:  # the importance is zero everywhere
             density = np.ones(len(density))
-        uniform = self.options.uniform
+        uniform = self.uniform
         if uniform is None:
             cost = float(np.average(density, weights=tiles.sizes * state.costs))
             uniform = uniform_share.choose(state.evidence, cost)

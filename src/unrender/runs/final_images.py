@@ -76,19 +76,10 @@ _SECOND_HALF = 1 << 16
 
 @dataclass(frozen=True)
 class FinalImages:
-    """Images at the end of a run.
+    """Images at the end of a run with `spp` samples per pixel, and what `Result` states about them.
 
     Attributes:
-        pictures: see `Result.pictures`.
-        errors: see `Result.image_errors`.
-        spp: samples per pixel of each image.
-        sensitivity: see `Result.sensitivity`.
-        undetermined: see `Result.undetermined`.
         warnings: one line for each unknown that had not settled at the end.
-        standard_error: see `Result.standard_error`.
-        data_share: see `Result.data_share`.
-        without_errors: see `Result.without_errors`.
-        misfit: see `Result.misfit`; None if no difference is found.
         rise: warning that the final images are worse than those of the start, where the verification was uncertain; "" if they are not.
             Nothing is tested then.
     """

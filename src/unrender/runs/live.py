@@ -219,7 +219,6 @@ class Live(Callback):
             control=self._command[1],
             process=os.getpid(),
             host=platform.node(),
-            update_seconds=self._cost,
             initial_error=self._initial_error,
             shapes=run.problem.shapes(),
         )

@@ -205,17 +205,27 @@ def _joined(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges as pairs of vertices (E, 2), and the number of faces of each."""
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique(sides, axis=0, return_counts=True)
+    return np.unique(_sides(faces), axis=0, return_counts=True)
+
+
+def _sides(faces: np.ndarray) -> np.ndarray:
+    """Return the sides ab, bc and ca of all faces (3 F, 2), each with its smaller vertex first."""
+    return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+
+
+def subdivided(faces: np.ndarray, vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Divide each triangle into four at the midpoints of its edges. Return the new faces, and the ends (E, 2) of the divided edges.
+
+    The midpoints, which adjacent triangles share, follow the old vertices in the order of these edges.
+    """
+    edges, which = np.unique(_sides(faces), axis=0, return_inverse=True)
+    (a, b, c), (ab, bc, ca) = faces.T, which.reshape(3, -1) + vertices
+    parts = (a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)
+    return np.concatenate([np.stack(corners, -1) for corners in parts]), edges
 
 
 def _subdivided(positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> ReplacedMesh:
-    """Divide each triangle into four at the midpoints of its edges; the old vertices come first."""
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, which = np.unique(sides, axis=0, return_inverse=True)
-    ab, bc, ca = which.reshape(3, -1) + len(positions)
-    a, b, c = faces.T
-    made = np.concatenate([np.stack(t, -1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
+    made, edges = subdivided(faces, len(positions))
     i, j = edges.T
 
     def extended(values: np.ndarray) -> np.ndarray:

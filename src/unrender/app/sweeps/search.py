@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -188,30 +189,24 @@ def _is_integer(name: str, method: Method) -> bool:
 _MOST_TRIALS = 100_000
 
 
-class Search(Protocol):
+class Search(ABC):
     """A search that proposes settings by number. `ask` and `tell` are called in ascending order of the numbers, once for each."""
 
-    @property
-    def trials(self) -> int:
-        """The number of trials."""
-        ...
+    trials: int
+    """Number of trials."""
+    learns: ClassVar[bool] = False
+    """Whether proposals depend on the outcomes of earlier trials."""
 
-    @property
-    def learns(self) -> bool:
-        """True if proposals depend on the outcomes of earlier trials."""
-        ...
-
+    @abstractmethod
     def ask(self, number: int) -> dict[str, str]:
         """Return {option: value as text} of a trial."""
-        ...
 
-    def tell(self, number: int, error: float | None) -> None:
+    def tell(self, number: int, error: float | None) -> None:  # noqa: B027 (only a search that learns has to listen)
         """Report the error to minimise of a trial that `ask` proposed; None for a failed one."""
-        ...
 
 
 @dataclass(frozen=True)
-class Grid:
+class Grid(Search):
     """All combinations of the points of the axes; the last axis varies fastest.
 
     Raises `InputError` for a range without a number of points, or more combinations than 100 000.
@@ -227,8 +222,6 @@ class Grid:
     def trials(self) -> int:
         return math.prod(len(axis.points()) for axis in self.axes)
 
-    learns = False
-
     def ask(self, number: int) -> dict[str, str]:
         values: dict[str, str] = {}
         for axis in reversed(self.axes):
@@ -237,30 +230,22 @@ class Grid:
             values[axis.name] = points[index]
         return {axis.name: values[axis.name] for axis in self.axes}
 
-    def tell(self, number: int, error: float | None) -> None:
-        """Do nothing: the settings do not depend on outcomes."""
-
 
 @dataclass(frozen=True)
-class Random:
+class Random(Search):
     """Independent random settings, each a function of the seed and the number: a longer sweep begins with the trials of a shorter one."""
 
     axes: Sequence[Axis]
     trials: int
     seed: int = 0
 
-    learns = False
-
     def ask(self, number: int) -> dict[str, str]:
         key = Key(self.seed, number)
         return {axis.name: axis.at(key.fold(i).uint32() / 2**32) for i, axis in enumerate(self.axes)}
 
-    def tell(self, number: int, error: float | None) -> None:
-        """Do nothing: the settings do not depend on outcomes."""
-
 
 @dataclass
-class TPE:
+class TPE(Search):
     """The tree-structured Parzen estimator, which proposes settings that are likely to be good after the earlier trials.
 
     The settings of a trial are a function of the axes, of the seed and of the outcomes reported before. The same sequence of calls

@@ -186,7 +186,6 @@ class LiveStatus(BaseModel):
         skipped, warnings: see `Result`.
         control: current command.
         process, host: process of the run.
-        update_seconds: duration of the last update of live/.
         initial_error: {key: root mean square error} before the first step.
         shapes: {key: shape} of the parameters, whose arrays in live/ may be smaller.
     """
@@ -206,7 +205,6 @@ class LiveStatus(BaseModel):
     control: StrictStr = "run"
     process: Annotated[StrictInt, Field(gt=0, lt=2**31)] | None = None
     host: StrictStr = ""
-    update_seconds: float = 0.0
     initial_error: dict[StrictStr, float] = {}
     shapes: dict[StrictStr, list[_Count]] = {}
 
