@@ -30,13 +30,7 @@ _GROWTH = 1.0
 
 @dataclass(frozen=True)
 class HalvedImage:
-    """Image of a view, (H, W, 3).
-
-    Attributes:
-        mean: mean of both halves.
-        variance: variance of the noise of `mean`.
-        one, other: images of the two halves of the samples, independent of each other.
-    """
+    """Image of a view, (H, W, 3): the mean of two independent halves of the samples, the variance of its noise, and the halves."""
 
     mean: Array
     variance: Array
@@ -46,12 +40,7 @@ class HalvedImage:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Derivatives of the loss by the pixels, (H, W, 3) each.
-
-    Attributes:
-        first, second: ℓ' and ℓ'' at the image.
-        one, other: ℓ' at two independent halves of the image.
-    """
+    """Derivatives ℓ' and ℓ'' of the loss by the pixels at the image, and ℓ' at two independent halves of it, (H, W, 3) each."""
 
     first: np.ndarray
     second: np.ndarray
@@ -195,14 +184,8 @@ def mean_residuals(
 ) -> HalvesMean:
     """Return the mean of ℓ' over steps, (H, W, 3), at the present parameters.
 
-    ℓ'' J s of the step s is added to earlier residuals. Otherwise the descent's own change would count as noise of the references.
-
-    Args:
-        before: mean of earlier steps.
-        weights: derivatives of the loss.
-        derivatives: derivative images, (m, H, W, 3).
-        step: last step, (m,).
-        moved: its length in units of the differences' widths.
+    ℓ'' J s of the last step s (m,), of length `moved` in widths of the differences, is added to earlier residuals. Otherwise the descent's
+    own change would count as noise of the references.
     """
     now = HalvesMean(weights.one.astype(np.float32), weights.other.astype(np.float32))
     if before is None:

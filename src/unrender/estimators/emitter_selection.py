@@ -34,12 +34,7 @@ _LEAST_VARIANCE = 0.1
 
 @dataclass(frozen=True)
 class EmitterRequest:
-    """Emitter sampling of a step.
-
-    Attributes:
-        probabilities: probability of each emitter, (E,), sum 1.
-        tangents: parameter tangents for `connections`; {} if the step does not update the probabilities.
-    """
+    """Emitter sampling of a step: probability of each emitter, (E,), sum 1, and tangents for `connections`, {} without an update."""
 
     probabilities: np.ndarray
     tangents: Tree

@@ -48,14 +48,9 @@ class Sheet:
 
 
 def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
-    """Return several sheets as one smooth mesh, so that they move as one shape. Intersecting sheets are not cut.
+    """Return several sheets as one smooth `mitsuba.Mesh` with normals, so that they move as one shape. Intersecting sheets are not cut.
 
-    Args:
-        name: id of the mesh.
-        pieces: at least one sheet; texture coordinates run from 0 to 1 on each, unless it has another origin.
-
-    Returns:
-        `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
+    Texture coordinates run from 0 to 1 on each, unless it has another origin.
     """
     positions, coordinates, normals, faces, count = [], [], [], [], 0
     for piece in pieces:
@@ -74,16 +69,9 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
 def triangles(
     name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
 ) -> Any:
-    """Return a smooth mesh of triangles, whose normals follow its vertices when these move.
+    """Return a smooth `mitsuba.Mesh` of triangles, whose normals follow its vertices when these move.
 
-    Args:
-        name: id of the mesh.
-        positions: (V, 3).
-        faces: vertex indices (F, 3), counter-clockwise seen from outside.
-        coordinates: texture coordinates, (V, 2); None for none.
-
-    Returns:
-        `mitsuba.Mesh` with normals; an entry of a scene dictionary.
+    Positions are (V, 3), faces (F, 3), counter-clockwise seen from outside, and texture coordinates (V, 2) or None.
     """
     return mesh_layout.build(name, positions, faces, None, coordinates, load_described(bsdf))
 
@@ -181,13 +169,8 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 def unrolled(directions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Add texture coordinates by longitude and latitude to a sphere of triangles, cut along the seam at -z and at the poles.
 
-    Args:
-        directions: unit directions (V, 3), as from `icosphere`.
-        faces: (F, 3).
-
-    Returns:
-        The direction index of each new vertex (W,), faces (F, 3), and texture coordinates (W, 2): u increases with longitude, beyond 1 at
-        the seam, v with latitude.
+    Returns the direction index of each new vertex (W,), faces (F, 3), and texture coordinates (W, 2): u increases with longitude, beyond 1
+    at the seam, v with latitude.
     """
     x, y, z = directions.T
     u, v = np.arctan2(x, z) / (2 * np.pi) + 0.5, 0.5 + np.arcsin(np.clip(y, -1, 1)) / np.pi
@@ -276,13 +259,7 @@ def _check(owner: str, name: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """A part of a body.
-
-    Attributes:
-        centre: (3,).
-        radii: along x, y and z before the tilt, (3,).
-        tilt: rotation about z in degrees.
-    """
+    """A part of a body: centre, radii along x, y and z before the tilt, and that rotation about z in degrees."""
 
     centre: tuple[float, float, float]
     radii: tuple[float, float, float]
@@ -313,11 +290,9 @@ def united(parts: Sequence[Ellipsoid], blend: float) -> Callable[[np.ndarray], n
 def around(
     depth: Callable[[np.ndarray], np.ndarray], low: Sequence[float], high: Sequence[float], spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mesh where a depth is 0, by marching cubes: positions (V, 3) and faces (F, 3), facing outward.
+    """Return the mesh where a depth is 0, by marching cubes in a box: positions (V, 3) and faces (F, 3), facing outward.
 
-    Args:
-        depth: function of points (N, 3) that returns (N,), positive inside; negative on the sides of the box.
-        low, high: corners of the box.
+    `depth` is a function of points (N, 3), positive inside; negative on the sides of the box.
     """
     from skimage import measure
 

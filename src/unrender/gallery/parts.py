@@ -19,14 +19,8 @@ Vector = Sequence[float] | np.ndarray
 
 
 def camera(origin: Vector, target: Vector, fov: float, resolution: int) -> dict[str, Any]:
-    """Return a pinhole camera, y upwards, with a square film and a box filter, so that pixels share no samples.
-
-    Args:
-        origin: position of the camera.
-        target: point in the centre of the image.
-        fov: full angle in degrees.
-        resolution: pixels along a side.
-    """
+    """Return a pinhole camera, y upwards, with a full angle in degrees and a square film with a box filter, so that pixels share no
+    samples."""
     return {
         "type": "perspective",
         "fov": fov,
@@ -50,24 +44,14 @@ def cameras_around(
     fov: float,
     resolution: int,
 ) -> dict[str, Any]:
-    """Return cameras "camera_0", "camera_1", ... around the y axis.
-
-    Args:
-        angles: angle of each camera in radians, from +z towards +x.
-        heights: their y in turn: two are alternately lower and higher.
-        target, fov, resolution: see `camera`.
-    """
+    """Return cameras "camera_0", "camera_1", ... around the y axis, at angles in radians from +z towards +x, and at `heights` in turn."""
     places = [(distance * np.sin(a), heights[n % len(heights)], distance * np.cos(a)) for n, a in enumerate(angles)]
     return {f"camera_{n}": camera(place, target, fov, resolution) for n, place in enumerate(places)}
 
 
 def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Return a rectangle that faces `right` × `up`; a texture is upright when viewed from its front.
-
-    Args:
-        right, up: vectors from the centre to the midpoints of two edges; perpendicular.
-        more: further entries, such as an emitter.
-    """
+    """Return a rectangle that faces `right` × `up`, perpendicular vectors to the midpoints of two edges; a texture is upright when viewed
+    from its front."""
     x, y = np.asarray(right, float), np.asarray(up, float)
     normal = np.cross(x, y)
     matrix = np.eye(4)
@@ -109,12 +93,7 @@ def light(*rgb: float) -> dict[str, Any]:
 
 
 def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> dict[str, Any]:
-    """Return a closed room, x and y in [-1, 1], z in [-1, 2.2], with walls that face inward.
-
-    Args:
-        walls: material of back, front, floor and ceiling.
-        left, right: materials of the other two.
-    """
+    """Return a closed room, x and y in [-1, 1], z in [-1, 2.2], with walls that face inward: `walls` are back, front, floor and ceiling."""
     return {
         "back": rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), walls),
         "left": rectangle((-1, 0, 0.6), (0, 0, -1.6), (0, 1, 0), left),
@@ -188,12 +167,7 @@ def environment(values: np.ndarray) -> dict[str, Any]:
 
 
 def sun(towards: Vector, *rgb: float) -> dict[str, Any]:
-    """Return light from one direction.
-
-    Args:
-        towards: direction towards the light, of any length.
-        rgb: radiance of a white surface that faces it; one number is grey.
-    """
+    """Return light from one direction, towards the light; `rgb` is the radiance of a white surface that faces it, one number for grey."""
     direction = -np.asarray(towards, float)
     irradiance = [np.pi * value for value in rgb]
     return {"type": "directional", "direction": direction.tolist(), "irradiance": colour(*irradiance)}
@@ -202,13 +176,8 @@ def sun(towards: Vector, *rgb: float) -> dict[str, Any]:
 def unknown_pose(
     shape: str, part: str, start: dict[str, float], bounds: tuple[float, float] | None = None
 ) -> list[Parameter]:
-    """Return coordinates of the pose of a shape or light, which are 0 in the true scene.
-
-    Args:
-        shape: id of the shape or light.
-        part: "translation" or "rotation".
-        start: {"x" | "y" | "z": initial value}; other coordinates are known.
-    """
+    """Return the coordinates {"x" | "y" | "z": initial value} of the "translation" or "rotation" of a shape or light, 0 in the true
+    scene."""
     return [Parameter(f"{shape}.{part}.{axis}", initial=value, bounds=bounds) for axis, value in start.items()]
 
 
@@ -277,12 +246,8 @@ def mix(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dict[str, Any]:
-    """Return a differentiable texture of values (H, W, C) or (H, W) as a Mitsuba dictionary.
-
-    Args:
-        values: the first row is at the top (v = 1), or at v = 0 with `repeat`.
-        repeat: number of copies in u and v from 0 to 1; every other copy is mirrored, so that there are no seams.
-    """
+    """Return a differentiable texture of values (H, W, C) or (H, W), whose first row is at the top (v = 1). With `repeat`, it is at v = 0,
+    and every other copy is mirrored, so that there are no seams."""
     pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], dtype=np.float32)
     if repeat is None:
         wrap, to_uv = "clamp", mi.ScalarTransform4f().translate([0, 1, 0]) @ mi.ScalarTransform4f().scale([1, -1, 1])

@@ -171,13 +171,7 @@ class Mug(fields.Rendered):
 
 
 def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, Any]:
-    """Return the glaze with a label, which faces the camera in the true scene.
-
-    Args:
-        glaze: material around the label.
-        cup: the cup from `_pieces()`.
-        texels: number of texels along a side.
-    """
+    """Return the glaze with a label of `texels` a side, which faces the camera in the true scene, on the cup from `_pieces()`."""
     outside = np.arange(len(cup)) <= np.argmax(cup[:, 0, 1])
     rows = np.flatnonzero(outside & (cup[:, 0, 1] >= _LABEL_HEIGHTS[0]) & (cup[:, 0, 1] <= _LABEL_HEIGHTS[1]))
     bottom, top = rows[[0, -1]] / (len(cup) - 1)

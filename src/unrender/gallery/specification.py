@@ -49,14 +49,7 @@ _SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) 
 def recall(
     scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray], aov: str = ""
 ) -> np.ndarray:
-    """Return the cached image, or the result of `render`, which is then cached if a cache folder exists.
-
-    Args:
-        scene: loaded Mitsuba scene.
-        sensor, spp, max_depth: rendering settings.
-        render: function that returns the image, (H, W, 3) float32.
-        aov: property of the first surface that the image has in place of radiance; "" for radiance.
-    """
+    """Return the cached image (H, W, 3) of these settings, or the result of `render`, which is then cached if a cache folder exists."""
     place = cache.folder(cache.REFERENCES)
     if place is None:
         return render()
@@ -185,10 +178,7 @@ def reconstruction(
 ) -> Problem:
     """Return the problem of a specification whose references show another scene, `target()`, than the initial `scene()`.
 
-    Args:
-        aov: see `reference`.
-        surface_of: key of the vertex positions whose true surface is that of the first mesh of the target; None for no true values.
-        max_depth: path length of the problem; None for that of the references.
+    `surface_of` is the key of the vertex positions whose true surface is that of the first mesh of the target, None for no true values.
     """
     true = load(specification.target)
     body = next((shape for shape in true.shapes() if shape.is_mesh()), None)

@@ -40,13 +40,7 @@ def cube(medium: dict[str, Any]) -> dict[str, Any]:
 
 
 def around(views: int, resolution: int, distance: float = 4.2, fov: float = 36.0) -> dict[str, Any]:
-    """Return cameras at equal angles around the y axis, alternately lower and higher, that look at the origin.
-
-    Args:
-        views: number of cameras.
-        resolution: pixels along a side.
-        fov: full angle in degrees.
-    """
+    """Return cameras at equal angles around the y axis, alternately lower and higher, that look at the origin; `fov` is in degrees."""
     angles = np.pi / 6 + 2 * np.pi * np.arange(views) / views
     heights = np.where(np.arange(views) % 2 == 0, 0.25, 0.6)
     return {

@@ -32,13 +32,8 @@ from unrender.statistics import meta
 
 @dataclass(frozen=True)
 class CoupledState:
-    """State of coupled gradients between steps.
-
-    Attributes:
-        parameters: parameters of the last step with a gradient; None before the first.
-        derivative: loss derivative of that step, (1, H, W, 3).
-        elements: {key: meta-estimate and statistics of each element of the gradient}; empty before the first step.
-    """
+    """State of coupled gradients between steps: parameters and loss derivative (1, H, W, 3) of the last step with a gradient, and {key:
+    meta-estimate and statistics of each element of the gradient}."""
 
     parameters: Tree | None = None
     derivative: Array | None = None
@@ -96,14 +91,8 @@ class Batch:
 
 @dataclass(frozen=True)
 class StreamState:
-    """State of a `Stream` between steps.
-
-    Attributes:
-        image: state of the image estimator.
-        pixels: state of the pixel sampler.
-        batches: mini-batches since full images were last rendered.
-        coupled: state of coupled gradients.
-    """
+    """State of a `Stream` between steps: of the image estimator, of the pixel sampler and of coupled gradients, and the number of
+    mini-batches since full images were last rendered."""
 
     image: Any
     pixels: Any
@@ -124,12 +113,7 @@ class _FrameRecord:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Record of one render for `Stream.backward`.
-
-    Attributes:
-        frames: records of the launches.
-        batch: its pixels; None for a full image.
-    """
+    """Record of one render for `Stream.backward`: its launches, and its pixels, None for a full image."""
 
     parameters: Tree
     frames: tuple[_FrameRecord, ...]
@@ -274,12 +258,7 @@ _HEADER = "__metadata__"
 
 @dataclass(frozen=True)
 class RendererState:
-    """State of a `Renderer` between steps.
-
-    Attributes:
-        step: number of renders so far.
-        streams: {index of the sensor as text, or "mini-batches": its state}.
-    """
+    """State of a `Renderer` between steps: number of renders so far, and {sensor as text, or "mini-batches": state}."""
 
     step: int
     seed: int
@@ -294,16 +273,8 @@ def write_state(path: Path, state: RendererState, options: dict[str, Any]) -> Pa
 
 
 def read_state(path: Path, options: dict[str, Any], pattern: RendererState) -> RendererState:
-    """Return the state in a file.
-
-    Args:
-        path: file of `write_state`.
-        options: options that the file must have.
-        pattern: a state with the same components.
-
-    Raises:
-        InputError: the file is damaged, or has other options.
-    """
+    """Return the state in a file of `write_state`, with the same components as `pattern`. Raises `InputError` if it is damaged, or has
+    other options."""
     size = path.stat().st_size if path.is_file() else 0
     data = bounded_files.read_bytes(path, min(size, _LARGEST), path.parent)
     length = int.from_bytes(data[:8], "little")

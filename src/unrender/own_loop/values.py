@@ -54,13 +54,8 @@ class _Render(dr.CustomOp):
 
 
 def with_drjit(backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> tuple[Any, ...]:
-    """Return the images, attached to `values` in Dr.Jit's derivative graph. Forward mode raises `RuntimeError`.
-
-    Args:
-        backward: function from the loss derivatives with respect to the images to the gradient, {key: tensor}.
-        images: detached tensors.
-        values: {key: tensor}, attached or not.
-    """
+    """Return the detached images, attached to `values` in Dr.Jit's derivative graph. `backward` returns the gradient for loss derivatives
+    with respect to the images. Forward mode raises `RuntimeError`."""
     attached: Any = dr.custom(_Render, backward, images, values)
     return attached if isinstance(attached, tuple) else (attached,)
 
@@ -70,11 +65,7 @@ def with_torch(
 ) -> tuple[Any, ...]:
     """Return the images, on the host, attached to `values` in PyTorch's derivative graph. Second derivatives are not supported.
 
-    Args:
-        backward: function from the loss derivatives with respect to the images to the gradient of each of `values`, on the host.
-        images: tensors on the host.
-        values: tensors on any device. They are moved to the host before the operation, so that PyTorch calls `backward` on the calling
-            thread, which is known to Dr.Jit.
+    Values are moved to the host before the operation, so that PyTorch calls `backward` on the calling thread, which is known to Dr.Jit.
     """
     return _torch_operation().apply(backward, images, *(value.to("cpu") for value in values))
 
@@ -131,15 +122,7 @@ class LoopParameters:
 
 
 class Exchange:
-    """Converts between a loop's arrays and the renderer's.
-
-    Args:
-        renderer: renderer that makes the arrays.
-        keys: keys of the parameters, in order.
-
-    Attributes:
-        known: {key: description of the parameter}.
-    """
+    """Converts between a loop's arrays and the renderer's, of `keys` in order; `known` are the descriptions of the parameters."""
 
     def __init__(self, renderer: Renderer, keys: tuple[str, ...]):
         self._renderer, self._keys = renderer, keys

@@ -70,26 +70,16 @@ class SampleCounts:
 
 @dataclass(frozen=True)
 class SampleShares:
-    """Rule that distributes a mean number of samples over the pixels: `least` each, and a share of the rest.
-
-    Attributes:
-        least: minimum number of samples per pixel, >= 2.
-        shares: relative share of the rest, per view (height, width), any scale, >= 0; equal shares if all are 0.
-        offsets: random offset of the rounding per view, uniform in [0, 1).
-    """
+    """Rule that distributes a mean number of samples over the pixels: `least` >= 2 each, and relative shares of the rest, per view (height,
+    width), >= 0, equal if all are 0. The offset of the rounding per view is uniform in [0, 1)."""
 
     least: int
     shares: tuple[np.ndarray, ...]
     offsets: tuple[float, ...]
 
     def counts(self, view: int, spp: int, array: Callable[[np.ndarray], Array]) -> SampleCounts:
-        """Return the counts of one view: `spp` times its pixels in total, rounded randomly so that each count has its share as expectation.
-
-        Args:
-            view: index of the view.
-            spp: mean samples per pixel, at least `least`.
-            array: function that makes arrays of the renderer.
-        """
+        """Return the counts of one view: `spp` >= `least` times its pixels in total, rounded randomly so that each count has its share as
+        expectation."""
         return SampleCounts.of(rounded(self.shares[view], spp, self.least, self.offsets[view]), array)
 
 
@@ -293,14 +283,8 @@ class ImagesOfViews(Mapping[int, Array]):
 
 
 def joined_views(problem: Problem, spp: int, key: Key) -> list[JoinedViews]:
-    """Return the full views of a step as frames of equally many views; [] if views should be rendered one by one.
-
-    A launch of few paths takes longer to start than to trace.
-
-    Args:
-        spp: samples per pixel.
-        key: random key of the step.
-    """
+    """Return the full views of a step as frames of equally many views; [] if views should be rendered one by one: a launch of few paths
+    takes longer to start than to trace."""
     sizes, count = [height * width for height, width in problem.sizes], len(problem.views)
     fitting = _MOST_JOINED // (problem.max_depth * spp * max(sizes))
     several = max((n for n in range(1, fitting + 1) if count % n == 0), default=1)

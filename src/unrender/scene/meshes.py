@@ -251,13 +251,8 @@ def check_regularizer(value: Any, mesh: _Arrays | None) -> MeshRegularizer | Non
 
 
 def check_remeshing(value: Any, mesh: _Arrays | None, uv: Callable[[], np.ndarray | None]) -> Remeshing | None:
-    """Return the remeshing of a mesh; None for none. Raises `InputError` if it does not suit the mesh.
-
-    Args:
-        value: the user's setting.
-        mesh: (positions, faces); None if the parameter is not the vertex positions of a mesh.
-        uv: function that returns the texture coordinates, or None if there are none.
-    """
+    """Return the remeshing of a mesh (positions, faces), None for another parameter; None for none. Raises `InputError` if it does not suit
+    the mesh."""
     if value is None:
         return None
     if mesh is None:
@@ -276,13 +271,8 @@ def check_self_intersection(choice: Any, mesh: _Arrays | None) -> None:
 
 
 def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str]:
-    """Return a notice about unusual topology: edges of more than two faces, and triangles without area. Empty if there is none.
-
-    Args:
-        key: key of the vertex positions.
-        positions: vertex positions as loaded, (V, 3).
-        faces: vertex indices, (F, 3).
-    """
+    """Return a notice about unusual topology as loaded: edges of more than two faces, and triangles without area. Empty if there is
+    none."""
     joined = weld(positions)[1][faces]
     flat = np.linalg.norm(area_normals(positions.astype(np.float64), faces), axis=1) == 0
     used = ~flat & (joined != np.roll(joined, 1, axis=1)).all(axis=1)

@@ -173,15 +173,8 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class _Unknown:
-    """Properties of an unknown that its prior uses.
-
-    Attributes:
-        channels: Number of values per texel, voxel or vertex.
-        near: Expected values, which broadcast with the cells; None for none.
-        palette: (k, channels); None for none.
-        repeated: Number of repeated columns at each end.
-        topology: Mesh of the vertices; None for grids and numbers.
-    """
+    """Properties of an unknown that its prior uses: values per texel, voxel or vertex, expected values, which broadcast with the cells,
+    palette (k, channels), repeated columns at each end, and mesh of the vertices."""
 
     channels: int
     near: np.ndarray | None

@@ -373,13 +373,7 @@ def open_scene(
     others: Sequence[str] = (),
     expressions: Mapping[str, Any] | None = None,
 ) -> Renderer:
-    """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`.
-
-    Args:
-        scene, max_depth, parameters: as for `Problem`.
-        others: keys of further parameters that will be used.
-        expressions: parameters of the scene that are functions of unknowns, as for `Problem`.
-    """
+    """Return the renderer of a scene in which the ties of these parameters are unknowns, and `others` will be used. Raises `FieldError`."""
     functions = expressions or {}
     renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])
     try:

@@ -31,13 +31,8 @@ ON_DEVICE = 1 << 29
 class References:
     """Values and loss weights of single pixels of the references.
 
-    Small sets are copied to the renderer's device once. From large sets only the requested pixels are copied, from host memory or from
-    the file of a `StoredPicture`.
-
-    Args:
-        views: views with references (H, W, 3) and masks (H, W) or None.
-        array: function that makes arrays of the renderer.
-        on_device: maximum size in bytes of references that are copied to the device.
+    Small sets, of at most `on_device` bytes, are copied to the renderer's device once. From large sets only the requested pixels are
+    copied, from host memory or from the file of a `StoredPicture`.
     """
 
     def __init__(self, views: Sequence[View], array: Callable[[np.ndarray], Array], on_device: int = ON_DEVICE):
@@ -54,12 +49,8 @@ class References:
         return arrays.like_integers(np.array([view.sensor for view in self._views]), self._array(np.zeros(1)))
 
     def at(self, views: Array, pixels: Array) -> tuple[Array, Array]:
-        """Return the reference values (N, 3) of these pixels, and the factors of their losses (N, 1): weight * mask / (H * W * 3).
-
-        Args:
-            views: index of each pixel's view, (N,).
-            pixels: row-major index in its film, (N,).
-        """
+        """Return the reference values (N, 3) of these pixels of views, and the factors of their losses (N, 1): weight * mask / (H * W *
+        3)."""
         if self.in_host_memory:
             return self._from_host(arrays.numpy(views), arrays.numpy(pixels))
         row = self.rows(views, pixels)

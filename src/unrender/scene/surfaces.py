@@ -102,12 +102,8 @@ def area_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def folds(vertices: np.ndarray, faces: np.ndarray) -> int:
-    """Return the number of edges whose two faces are rotated by more than 120 degrees relative to each other.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3), position indices: vertices split along seams must be merged, or their edges count as borders.
-    """
+    """Return the number of edges whose two faces are rotated by more than 120 degrees relative to each other. Vertices (V, 3) split along
+    seams must be merged in the faces (F, 3), or their edges count as borders."""
     normals = area_normals(vertices, faces)
     length = np.linalg.norm(normals, axis=1)
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -147,17 +143,10 @@ _CELLS_PER_TRIANGLE = 8
 
 
 def crossing_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return pairs of triangles where an edge of one passes through the interior of the other.
+    """Return pairs of triangles (N, 2), the lower one first, sorted, where an edge of one passes through the interior of the other.
 
-    Excluded are triangles that only touch, that lie in one plane, or that share an edge (these can only fold: `surfaces.folds`).
-    Triangles that share one vertex count if the opposite edge passes through the other triangle.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3), position indices: vertices split along seams must be merged, or their triangles count as unconnected.
-
-    Returns:
-        Face indices, (N, 2), the lower one first, sorted.
+    Excluded are triangles that only touch, that lie in one plane, or that share an edge (these can only fold: `surfaces.folds`). Triangles
+    that share one vertex count if the opposite edge passes through the other triangle. Vertices split along seams must be merged.
     """
     if len(faces) < 2:
         return np.zeros((0, 2), int)
@@ -230,11 +219,7 @@ def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: 
     """Return vertex positions (3 V,) between `before` and `after` at which no triangle has turned over; `after` itself if possible.
 
     The step is halved up to three times. Vertices of triangles that would still turn over do not move. Degenerate triangles are ignored.
-
-    Args:
-        before, after: vertex positions, (3 V,).
-        faces: vertex indices, (F, 3).
-        crossing: whether triangles may intersect; if not, new intersections count as turned over.
+    Without `crossing`, new intersections count as turned over.
     """
     start, end = before.reshape(-1, 3).astype(np.float64), after.reshape(-1, 3).astype(np.float64)
     normals = area_normals(start, faces)

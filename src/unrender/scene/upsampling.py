@@ -40,16 +40,8 @@ class NotCarried(Exception):
 
 @dataclass
 class Upsampler:
-    """Interpolation from the parameters' current shapes to those of a step.
-
-    Args:
-        problem: problem whose `coarse_to_fine` gives the shapes.
-        step: the next step.
-        parameters: the current parameters at the coarse resolution.
-
-    Attributes:
-        shares: {key: 1/n} of the parameters whose shape changes.
-    """
+    """Interpolation from the current shapes of coarse parameters to those of the next step, by `coarse_to_fine`; `shares` are {key: 1/n} of
+    those whose shape changes."""
 
     problem: Problem
     step: int

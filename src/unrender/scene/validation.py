@@ -312,16 +312,8 @@ def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
 def check_truth(
     key: str, value: Any, known: Mapping[str, ParameterInfo], unknowns: Mapping[str, Unknown]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the true value of an unknown, float32, and notices of how it was converted, and of values outside the bounds.
-
-    Args:
-        value: the value as passed.
-        known: the scene's parameters.
-        unknowns: the problem's unknowns.
-
-    Raises:
-        FieldError: the value does not suit the parameter.
-    """
+    """Return the true value of an unknown, float32, and notices of how it was converted, and of values outside the bounds. Raises
+    `FieldError` if it does not suit the parameter."""
     if key not in unknowns:
         raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, unknowns)}")
     with FieldError.at(("truth", key)):

@@ -174,13 +174,8 @@ _WHITE = 0.001
 
 
 def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
-    """Return the views with their images, in memory or in a file if they are large, and notices. Raises `FieldError`.
-
-    Args:
-        views: views as passed to the problem.
-        renderer: renderer whose films give sizes and formats.
-        loss: loss; one that handles saturated pixels needs no notice of them.
-    """
+    """Return the views with their images, in memory or in a file if they are large, and notices, except of saturated pixels that the loss
+    handles. Raises `FieldError`."""
     checked, notices, losing, resolutions = [], [], list[int](), renderer.resolutions()
     total = sum(12 * math.prod(resolutions[view.sensor]) for view in views)
     store = PictureStore() if total > ON_DEVICE else None
@@ -216,16 +211,8 @@ def check_sensor(index: int, view: View, count: int) -> None:
 def _check_view(
     index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
 ) -> tuple[View, list[str], bool]:
-    """Return the view with reference (H, W, 3) and mask (H, W) as float32 arrays, notices, and `Reference.loses_alpha`.
-
-    Raises `FieldError` for an invalid field.
-
-    Args:
-        view: view as passed.
-        resolutions: (height, width) of each sensor's film.
-        films: renderer that may know the films' formats.
-        tell_saturated: whether a reference with saturated pixels gets a notice.
-    """
+    """Return the view with reference (H, W, 3) and mask (H, W) as float32 arrays, notices (of saturated pixels if `tell_saturated`), and
+    `Reference.loses_alpha`. Raises `FieldError` for an invalid field."""
     owner = f"view {index}"
 
     def wrong(field: str, what: str | Exception) -> FieldError:

@@ -34,14 +34,8 @@ def of_views(
 ) -> tuple[Renderer, tuple[View, ...]]:
     """Return a renderer in which each view's world is a sensor, and the views with these sensors.
 
-    Args:
-        renderer: renderer of the problem's scene.
-        views: views as passed to the problem.
-        keys: keys of the unknowns.
-        opened: function from a scene to its renderer; called once for equal scenes.
-
-    Raises:
-        FieldError: a sensor, key or value is invalid, or a scene has none of the unknowns.
+    `opened` is the function from a scene to its renderer; called once for equal scenes. Raises `FieldError` if a sensor, key or value is
+    invalid, or a scene has none of the unknown keys.
     """
     renderer, sensors = _turned(renderer, views, keys)
     if sensors:
@@ -101,24 +95,13 @@ def is_storable(renderer: Renderer, views: Sequence[View]) -> bool:
 
 
 def requested_depth(renderer: Renderer, views: Sequence[View], max_depth: int) -> int | None:
-    """Return the `max_depth` with which the scenes of views are opened again: None if each view's own scene has its integrator's.
-
-    Args:
-        renderer: renderer of a problem.
-        views: its views, as passed.
-        max_depth: its `max_depth`.
-    """
+    """Return the `max_depth` with which the scenes of views are opened again: None if each view's own scene has its integrator's."""
     own = any(view.scene is not None for view in views)
     return getattr(scene_renderer(renderer), "requested_depth", max_depth) if own else max_depth
 
 
 def check_determined(views: Sequence[View], unknowns: Mapping[str, Collection[str]]) -> None:
-    """Raise `FieldError` if all views know all parameters of the scene that an unknown sets.
-
-    Args:
-        views: all views of a problem.
-        unknowns: {key of an unknown: keys of the scene that it sets}.
-    """
+    """Raise `FieldError` if all views know all parameters of the scene that an unknown sets, {key: keys of the scene}."""
     for key, members in unknowns.items():
         if all(set(members) <= (view.known or {}).keys() for view in views):
             what = f"{key} is known in all views, so none determines it; leave it out of one, or of the unknowns"

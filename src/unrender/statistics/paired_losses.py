@@ -23,13 +23,8 @@ rate of its test."""
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of two losses.
-
-    Attributes:
-        value: the second loss minus the first.
-        standard_error: standard error of `value`; infinite if it cannot be estimated.
-        degrees: degrees of freedom of the standard error (Welch and Satterthwaite).
-    """
+    """The second of two losses minus the first, its standard error, infinite if unknown, and its degrees of freedom (Welch and
+    Satterthwaite)."""
 
     value: float
     standard_error: float
@@ -71,13 +66,9 @@ class SystematicDifference:
 
 
 def pseudo_values(losses: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Return the jackknife pseudo-values (K, N) of N losses.
+    """Return the jackknife pseudo-values (K, N) of N losses at the mean of K images, (N,), and with each image left out, (K, N).
 
     Their mean over K is the loss without the bias from image noise: exactly for a quadratic loss, to second order otherwise.
-
-    Args:
-        losses: losses at the mean of K images, (N,).
-        left_out: losses at the mean of all images but one, (K, N).
     """
     count = len(left_out)
     return count * losses - (count - 1) * left_out
@@ -128,13 +119,10 @@ def slices_of_images(sizes: Sequence[tuple[int, int]]) -> list[slice]:
 
 
 def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:
-    """Return the part of two pictures' differences from one reference that both share, pixel by pixel.
+    """Return the part of two pictures' differences (K, N, C) from one reference that both share, pixel by pixel, with weights (N,) in [0,
+    1].
 
     For pictures of few pixels, of which `systematic` makes too few tiles. Noise of the reference is shared too, and counts.
-
-    Args:
-        one, other: (K, N, C), differences of K independent images of each picture.
-        weights: (N,), how much each pixel counts, in [0, 1].
     """
     means, errors = [], []
     for images in (one, other):

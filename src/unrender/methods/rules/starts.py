@@ -37,13 +37,7 @@ _FACTORS = (1e-2, 1e2)
 
 @dataclass(frozen=True)
 class Place:
-    """Values of some unknowns whose picture is much better.
-
-    Attributes:
-        values: {key: array} of the unknowns that change.
-        share: loss there relative to that of the given values.
-        loss: loss there, without the picture's noise.
-    """
+    """Values of some unknowns whose picture is much better; its loss without noise, and relative to that of the given values."""
 
     values: dict[str, np.ndarray]
     share: float
@@ -169,15 +163,7 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Pictures of places of some unknowns.
-
-    Attributes:
-        problem, pictures: problem, and renderer of the pictures.
-        values: {key: array}, the given values of all unknowns.
-        keys: keys of the varied unknowns.
-        lights: keys of the unknowns with a common factor.
-        limits: limits of that factor.
-    """
+    """Pictures of places of varied unknowns `keys`, and limits of the common factor of the `lights`."""
 
     problem: Problem
     pictures: FreshPictures
