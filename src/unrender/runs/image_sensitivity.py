@@ -19,6 +19,7 @@ from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, selected_views, view_request
+from unrender.statistics.overlap import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 MAP_AXES = 3
@@ -43,8 +44,9 @@ class Curvature:
 
     Attributes:
         squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
-        overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements. It is
-            infinite if it is unknown: too few probes are made, or fit into memory.
+        overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements, 1.27 with
+            linear interpolation of texels larger than pixels. The sum is over neighbours i and j, and over others where these are more than
+            noise. It is infinite if too few probes are made, or fit into memory, and NaN if their noise hides the diagonal.
         smooth: {key: tr(SAS) / tr(SS)}, at least 1, of textures and grids, for A = JᵀJ with unit diagonal and the means S over neighbouring
             cells: the eigenvalue of smooth changes, 1 if no pixel depends on two elements. Infinite like `overlap`.
         probes: number of probes of the estimate.
@@ -112,7 +114,7 @@ def curvature(
 ) -> Curvature:
     """Return the curvature of `sensitivity`, with the same arguments.
 
-    The overlap is the mean of (Jᵀs · Jᵀs')² over pairs of probes, whose expectation is Σ_ij (JᵀJ)_ij², with separate paths of its factors.
+    (JᵀJ)_ij² is the expectation of (Jᵀs)_i (Jᵀs)_j (Jᵀs')_i (Jᵀs')_j over pairs of probes, with separate paths of the first two factors.
     With the `noise` (H, W, 2) of each view, a and b of the root a I + b 11ᵀ of the channels' covariance, the probes are also weighted by
     that root, on the same paths.
     """
@@ -142,7 +144,7 @@ def curvature(
             if key in stored and made < most:
                 stored[key].append((one[key][0].astype(np.float32), other[key][0].astype(np.float32)))
         made += 1
-    overlap = {key: _overlap(squares[key] / made, made, of) for key, of in stored.items()}
+    overlaps = {key: overlap(of) if len(of) >= FEWEST_PROBES else np.inf for key, of in stored.items()}
     smooth = {key: _smooth_eigenvalue(squares[key] / made, of) for key, of in stored.items()}
     means, variances = (
         {
@@ -151,7 +153,7 @@ def curvature(
         }
         for sums in (squares, noisy)
     )
-    return Curvature(means, overlap, smooth, made, variances)
+    return Curvature(means, overlaps, smooth, made, variances)
 
 
 def root_of_covariance(variance: np.ndarray | float, correlation: float) -> np.ndarray:
@@ -171,20 +173,6 @@ def shown_elsewhere(problem: Problem, sensitivity: np.ndarray | None, step: np.n
         return False
     largest = max(height * width for height, width in problem.sizes)
     return float(np.sum(np.square(sensitivity * step, dtype=np.float64))) > 3 * largest * least**2
-
-
-def _overlap(squares: np.ndarray, probes: int, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii² from diagonal elements, whose noise it removes, and the projections of probes.
-
-    It is infinite for too few projections, or without a curvature.
-    """
-    if len(stored) < FEWEST_PROBES:
-        return np.inf
-    pairs = [
-        float(np.vdot(a[0], b[0])) * float(np.vdot(a[1], b[1])) for n, a in enumerate(stored) for b in stored[n + 1 :]
-    ]
-    diagonal = float(np.sum(np.square(squares))) / (1.0 + 2.0 / probes)
-    return max(1.0, sum(pairs) / len(pairs) / diagonal) if diagonal > 0.0 else np.inf
 
 
 def _smooth_eigenvalue(squares: np.ndarray, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:

@@ -35,12 +35,12 @@ _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
 _SPP, _PATHS = (8, 256), 1 << 20
 """Samples per pixel of each half of the pictures, and their paths of all views."""
-_PROBES = 4.0
-"""Number of probes that the curvature of the neighbours weighs as much as."""
-_ERRORS = 3.0
-"""Standard errors by which the residual must exceed the pictures' noise, or there is no map."""
-_MOST_OVERLAP = 1.3
-"""Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
+_PROBES, _ERRORS = 4.0, 3.0
+"""Number of probes that the curvature of the neighbours weighs as much as; standard errors by which the residual must exceed the pictures'
+noise, or there is no map."""
+_MOST_OVERLAP, _UNSURE = 1.5, 0.5
+"""Overlap from which on texels are not independent, such as with more texels than pixels that see them; interpolation alone has 1.27.
+Standard error of the mean residual of all texels, relative to their variance, from which on a residual is not known."""
 _ELEMENTS, _LEAST = 9.0, 0.1
 """Number of elements whose weight the mean over all cells has in a mean with the neighbours, and the least ratio to it."""
 _CORNERS = tuple(np.s_[a, b] for a in (slice(1, None), slice(-1)) for b in (slice(1, None), slice(-1)))
@@ -99,7 +99,7 @@ def uncertainty(
     pixels do not share. τ² is the mean square change from the start plus the mean variance, and p the curvature of the parameter's prior.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
-    and a diagonal does not bound their errors; nor have textures with κ ≥ 1.3, such as those with more texels than pixels that see them,
+    and a diagonal does not bound their errors; nor have textures with κ ≥ 1.5, such as those with more texels than pixels that see them,
     and textures of which the picture is no linear function, such as of a roughness, a normal map or a weight.
     There is none either if time or samples are too few.
 
@@ -110,7 +110,7 @@ def uncertainty(
         seed: seed of all random numbers.
 
     Returns:
-        Maps of the textures with path gradients and κ < 1.3, and standard errors of the numbers.
+        Maps of the textures with path gradients and κ < 1.5, and standard errors of the numbers.
 
     Raises:
         InputError: `values` have other keys or shapes than the problem's.
@@ -192,7 +192,7 @@ def of_residuals(
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
         posterior = own.posterior((one[key], other[key]), known.smooth[key], noise.is_known, prior)
         if posterior is None:
-            reasons[key] = "the pictures have too few samples to tell their differences from the references from noise"
+            reasons[key] = "too few samples tell the pictures' differences from the references from noise"
             continue
         errors[key], shares[key] = np.sqrt(posterior.variance).astype(np.float32), posterior.share.astype(np.float32)
         if noise.is_known and posterior.of_noise >= _OF_NOISE:
@@ -216,7 +216,8 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
         return "pictures may not change in proportion to it"
     if known.probes < FEWEST_PROBES:
         return TOO_SHORT
-    overlap = known.overlap.get(key, math.inf)
+    if math.isnan(overlap := known.overlap.get(key, math.inf)):
+        return "the noise of the renderings hides how the pictures depend on its texels; larger lights have less"
     if math.isinf(overlap):
         return "it has too many texels to measure whether pixels see several of them"
     return "" if overlap < _MOST_OVERLAP else "pixels see several texels, so errors of texels depend on each other"
@@ -276,12 +277,12 @@ class _Cells:
         f = self._followed(one, other)
         least = f**2 + (1.0 - f**2) / _BLOCK
         c = np.maximum(np.maximum(pooled + (2.0 * f - 1.0) * self.noise, least * self.noise), 1e-12)
-        before = float(np.square(self.change)[counted].mean()) + float(c[counted].mean()) / float(
-            self.curvature[counted].mean()
-        )
-        precision = (self.curvature / c)[..., None] * np.ones(channels)
-        others = 1.0 / max(before, 1e-12) + prior
         noise = float(self.noise[counted].mean())
+        if not m.is_known and m.error > _UNSURE * max(m.value + (2.0 * f - 1.0) * noise, least * noise):
+            return None
+        before = float(np.square(self.change)[counted].mean() + c[counted].mean() / self.curvature[counted].mean())
+        precision = np.repeat((self.curvature / c)[..., None], channels, axis=-1)
+        others = 1.0 / max(before, 1e-12) + prior
         total = max(m.value + _SURE * m.error + (2.0 * f - 1.0) * noise, f**2 * noise, 1e-12)
         of_noise = f**2 * noise / total if f >= _LEAST_FOLLOWED else 0.0
         return _Posterior(1.0 / np.maximum(precision, others), precision / (precision + others), of_noise)
