@@ -185,14 +185,7 @@ def observed(problem: Problem, state: EmitterState, gradient: Tree) -> EmitterSt
 
 
 def check(owner: str, emitters: Any, groups: int, equal_counts: bool) -> None:
-    """Raise `InputError` for a choice of emitters that the samples do not support.
-
-    Args:
-        owner: class name for messages.
-        emitters: the option.
-        groups: number of leave-one-out groups.
-        equal_counts: whether all pixels have equal sample counts.
-    """
+    """Raise `InputError` for a choice of emitters that the leave-one-out groups, or pixels of unequal sample counts, do not support."""
     if emitters == "adaptive" and not equal_counts:
         raise InputError(
             f'{owner}: emitters="adaptive" needs equal sample counts in all pixels; use another pixel sampler than AdaptiveCounts'

@@ -62,14 +62,8 @@ class Picture:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Pixels of one view, or a list of pixels of all views.
-
-    Attributes:
-        view: index of the view, all of whose pixels are rendered; None for a list of pixels.
-        views, pixels: index of each pixel's view, and its row-major index in the film, (N,).
-        reference: reference of each pixel, (N, 3).
-        factors: factor of each pixel's loss, (N, 1).
-    """
+    """Pixels of one view, all of which are rendered, or a list of pixels of all views (`view` is None), with view and row-major index of
+    each, (N,), its reference (N, 3) and the factor of its loss (N, 1)."""
 
     view: int | None
     views: np.ndarray
@@ -139,13 +133,8 @@ class FreshPictures:
         return images_by_frame
 
     def images_of(self, states: Sequence[Mapping[str, np.ndarray]], varied: Sequence[str]) -> list[list[np.ndarray]]:
-        """Return `images` of each state. Where all pixels are rendered, states that differ in poses of shapes share launches, with a
-        quarter of the samples.
-
-        Args:
-            states: {key: array} of the same keys, equal except for those of `varied`.
-            varied: keys of unknowns.
-        """
+        """Return `images` of each state; these differ in the unknowns `varied` alone. Where all pixels are rendered, states that differ in
+        poses of shapes share launches, with a quarter of the samples."""
         known = self._problem.renderer.parameters()
         posed = all(known[key].shape_pose for key in varied)
         if self.sampled or self._parts > 1 or not posed:

@@ -69,13 +69,8 @@ class System:
 
 
 class Point:
-    """Images and derivative images of a problem at its parameters.
-
-    Attributes:
-        samples: number of paths traced so far.
-        largest: largest width of each parameter, infinite if there is none.
-        scores: whether residuals are averaged over steps.
-    """
+    """Images and derivative images of a problem at its parameters, with the paths traced so far, and the largest width of each parameter,
+    infinite if there is none."""
 
     def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
         self.options, self.problem, self.parameters = options, problem, parameters

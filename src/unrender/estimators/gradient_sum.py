@@ -17,13 +17,8 @@ _SIDE = 9
 
 
 def damping(residual: Array, variance: Array, tolerance: float) -> Array:
-    """Return |r| / √(r² + κ² σ²). Times the derivative of |r|, it is the derivative of Charbonnier's loss √(r² + δ²), with δ = κ σ.
-
-    Args:
-        residual: r, image minus reference, (..., H, W, 3).
-        variance: σ² of the image, (H, W, 3).
-        tolerance: κ, > 0.
-    """
+    """Return |r| / √(r² + κ² σ²) for residuals r (..., H, W, 3), variances σ² of the image (H, W, 3) and tolerance κ > 0. Times the
+    derivative of |r|, it is the derivative of Charbonnier's loss √(r² + δ²), with δ = κ σ."""
     square = residual * residual
     return arrays.sqrt(square / (square + (tolerance * tolerance) * variance + 1e-20))
 

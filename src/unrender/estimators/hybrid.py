@@ -45,12 +45,7 @@ _MEAN, _SQUARE = 0.9, 0.999
 
 
 def beyond_paths(known: Mapping[str, ParameterInfo], keys: Sequence[str]) -> tuple[str, ...]:
-    """Return the keys that path gradients do not suit: parameters without a path gradient, and poses, whose loss has plateaus.
-
-    Args:
-        known: result of `Renderer.parameters`.
-        keys: in any order.
-    """
+    """Return the keys that path gradients do not suit: parameters without a path gradient, and poses, whose loss has plateaus."""
     return tuple(key for key in keys if known[key].rigid or not known[key].differentiable)
 
 
@@ -264,14 +259,8 @@ class HybridGradient:
         key: Key,
         compiles: bool,
     ) -> tuple[Estimate, HybridState, int]:
-        """Return the estimate with a block, the state, and the paths traced. With `compiles`, the block is estimated in any case.
-
-        Args:
-            problems: problem of each of the two estimators.
-            parameters, part: all parameters, and those of the block.
-            state, key: state and random numbers.
-            compiles: whether this is the warm-up.
-        """
+        """Return the estimate with a block, the state, and the paths traced. `part` are the parameters of the block; in the warm-up
+        (`compiles`), it is estimated in any case."""
         fixed = Estimate(0.0, trees.zeros_like(part), (BlockEstimate(tuple(part), None),))
         moves = state.step >= self.wait and (state.step - self.wait) % self.every == 0
         if not (moves or compiles):

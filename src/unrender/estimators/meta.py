@@ -31,17 +31,9 @@ _PROPORTIONAL_SPP, _DIFFERENCE_SPP, _COUPLED_SPP = 2, 1, 3
 
 @dataclass(frozen=True)
 class MetaState:
-    """State between steps.
-
-    Attributes:
-        parameters: parameters of the last step; None before the first.
-        elements: {key: meta-estimate and statistics of each element of its gradient}; empty before the first step.
-        image: state of the image estimator, in the coupled form.
-        pixels: state of the pixel sampler.
-        step: number of steps of full views; see `PairRequest.step`.
-        batches: number of steps with pixel mini-batches since the last of full views.
-        free: {key: 0 for the elements that stayed at a bound in the last step, 1 for the others}, see `HeldElements`.
-    """
+    """State between steps: parameters of the last step, {key: meta-estimate and statistics of each element}, and states of the image
+    estimator and of the pixel sampler. `step` counts steps of full views, `batches` those of mini-batches since; `free` is 0 for elements
+    that stayed at a bound in the last step, see `HeldElements`."""
 
     parameters: Tree | None
     elements: dict[str, meta.State]

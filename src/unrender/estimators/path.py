@@ -35,15 +35,8 @@ _WINDOW = 8
 
 @dataclass(frozen=True)
 class PathGradientState:
-    """State between steps.
-
-    Attributes:
-        image: state of the image estimator.
-        pixels: state of the pixel sampler.
-        batches: number of steps with pixel mini-batches since the last that rendered full views.
-        step: number of estimates so far.
-        emitters: state of the emitter probabilities; None for the scene's own.
-    """
+    """State between steps: of the image estimator, of the pixel sampler and of the emitter probabilities, None for the scene's own; number
+    of estimates so far, and of steps with mini-batches since the last of full views."""
 
     image: Any
     pixels: Any

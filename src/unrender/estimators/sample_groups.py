@@ -257,15 +257,8 @@ def draws_pixels(pixels: PixelSampler) -> bool:
 
 
 def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, adjoint_spp: int | None = None) -> None:
-    """Raise `InputError` for an invalid pixel sampler, for mini-batches or sample counts that the image estimator does not support, or
-    for too few samples.
-
-    Args:
-        owner: class name for messages.
-        pixels: the sampler.
-        fewest: minimum number of samples per pixel of any gradient of a step.
-        adjoint_spp: see `PathGradient`.
-    """
+    """Raise `InputError` for an invalid pixel sampler, for mini-batches or sample counts that the image estimator does not support, or for
+    fewer than `fewest` samples per pixel of any gradient of a step."""
     if isinstance(pixels, type) or not isinstance(pixels, PixelSampler):
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
@@ -374,13 +367,8 @@ def _noise_weights(derivative: Callable[[Array], Array], images: Array, others: 
 def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: Array, weights: Array) -> Array:
     """Return the loss derivative at this step's samples alone.
 
-    If the derivative is not linear, it is taken along the secant at the image that the loss sees, since L1's own would be the sign of
-    the noise.
-
-    Args:
-        problem, frame: they determine loss and reference.
-        others: its leave-one-out images.
-        weights: loss derivative at these; it must be damped (`tolerance`) if it is not linear, since the secant would be unbounded.
+    If the derivative is not linear, it is taken along the secant at the image that the loss sees, since L1's own would be the sign of the
+    noise. `weights`, that at the leave-one-out images, must then be damped (`tolerance`), since the secant would be unbounded.
     """
     fresh = image.fresh_others()
     if problem.loss.linear or not isinstance(frame, (FullView, JoinedViews)):

@@ -44,13 +44,8 @@ _LAST = 3
 
 @dataclass(frozen=True)
 class Response:
-    """Response of the eliminated textures to a change of few numbers.
-
-    Attributes:
-        slopes: S, {key of a texture: (n, *shape)} for n elements of the numbers.
-        curvature: mean of L over steps, {key: shape}; {} before the first.
-        count: number of steps so far.
-    """
+    """Response of the eliminated textures to a change of few numbers: S, {key of a texture: (n, *shape)}, after `count` steps, and the mean
+    of L over these, {key: shape}."""
 
     slopes: dict[str, np.ndarray]
     curvature: dict[str, np.ndarray] = field(default_factory=dict)
@@ -83,16 +78,10 @@ def can_be_eliminated(unknown: Unknown) -> bool:
 def update_response(
     response: Response, problem: Problem, parameters: Tree, images: DerivativeImages, spp: int, key: Key
 ) -> tuple[Response, int]:
-    """Return the response after one step, and the number of paths traced for images.
+    """Return the response after one step, from derivative images J along the present one, and the number of paths traced for images.
 
-    The cost for each view is that of `IMAGES` images, and of an adjoint for each element and one more.
-
-    Args:
-        response: response so far.
-        problem: problem with path gradients of the textures.
-        images: derivative images J along the present response.
-        spp: samples per pixel of the adjoints.
-        key: random numbers, independent of those of J.
+    The cost for each view is that of `IMAGES` images, and of an adjoint of `spp` samples for each element and one more. Random numbers are
+    independent of those of J.
     """
     session = problem.renderer.prepare(list(parameters), None)
     ends = {key: _ends(arrays.numpy(parameters[key]), problem.unknowns[key].project) for key in response.slopes}

@@ -117,13 +117,7 @@ class Perceptual:
 
 
 class _Network:
-    """The layers of VGG-16 up to the last one that is compared.
-
-    Args:
-        tensors: {"features.0.weight": ...}.
-        layers: names in `LAYERS`.
-        dtype: "float32" or "float64".
-    """
+    """The layers of VGG-16 up to the last one that is compared, from tensors {"features.0.weight": ...} of "float32" or "float64"."""
 
     def __init__(self, tensors: Mapping[str, Any], layers: tuple[str, ...], dtype: str):
         torch = _torch()

@@ -107,14 +107,9 @@ class Plan:
 
 
 def bind(part: Any, topology: Callable[[str], MeshTopology | None], repeated: Mapping[str, int]) -> Any:
-    """Return an optimizer whose preconditioners know the neighbours of a parameter's elements.
+    """Return an optimizer whose preconditioners know the neighbours of a parameter's elements: its mesh, and repeated border columns.
 
     Every `FittedSobolev` is bound, wherever it is among the fields of the optimizer and its parts.
-
-    Args:
-        part: optimizer, transform, or a tuple of these.
-        topology: function from a key to the parameter's mesh; None if it has none.
-        repeated: {key: number of repeated border columns}.
     """
     if isinstance(part, FittedSobolev):
         return part.bound(topology, repeated)

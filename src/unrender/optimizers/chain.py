@@ -24,14 +24,8 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class ChainState:
-    """State of a chain between steps.
-
-    Attributes:
-        step: Number of steps so far.
-        learning_rates: {key: η}, without schedule and factors.
-        states: States of the transforms, in order.
-        begun: Step at which these states started.
-    """
+    """State of a chain between steps: those of the transforms, in order, which started at the step `begun`, and {key: η} without schedule
+    and factors."""
 
     step: int
     learning_rates: dict[str, float]

@@ -25,13 +25,8 @@ from unrender.schedules import Schedule
 
 @dataclass(frozen=True)
 class NewtonState:
-    """State between steps.
-
-    Attributes:
-        step: number of steps so far.
-        learning_rates: learning rate of each parameter, its scale.
-        adam: state of the inner Adam, in double precision on the host; None without one.
-    """
+    """State between steps: learning rate of each parameter, its scale, and the inner Adam, in double precision on the host, if there is
+    one."""
 
     step: int
     learning_rates: dict[str, float]

@@ -114,13 +114,7 @@ def learned(
 
 
 def check_batch(owner: str, problem: Problem, count: int) -> None:
-    """Raise `InputError` if the loss is not pixelwise, or if `count` is above 65536 and above four times the pixels of all views.
-
-    Args:
-        owner: name of the sampler, for the message.
-        problem: the problem to render.
-        count: pixels per step.
-    """
+    """Raise `InputError` if the loss is not pixelwise, or if `count` is above 65536 and above four times the pixels of all views."""
     if not problem.loss.pixelwise:
         raise InputError(
             f"pixels: {type(problem.loss).__name__} is a loss of full images, which does not support pixel mini-batches; "

@@ -71,13 +71,10 @@ _MARGIN = 4
 
 
 def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.ndarray) -> np.ndarray:
-    """Denoise a map (tiles, 3), with the tiles of each view as an image; unchanged for "none".
+    """Denoise a map (tiles, 3), means over the numbers of paths (tiles,), with the tiles of each view as an image; unchanged for "none".
 
-    Args:
-        values: mean over each tile's paths.
-        by: "auto" is optix on a GPU, oidn if it is installed, else pooling (`pool`). Pooling spreads single bright paths, which dominate
-            second moments, without losing them.
-        counts: number of paths of each tile, (tiles,).
+    "auto" is optix on a GPU, oidn if it is installed, else pooling (`pool`). Pooling spreads single bright paths, which dominate second
+    moments, without losing them.
     """
     if by == "none":
         return values
@@ -246,11 +243,6 @@ def costs(
     The cost is 1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor, a path that leaves
     the scene costs as much as half a vertex in mini-batches of 16384 pixels. In batches of 2048, where launches dominate, it costs as much
     as four.) It is estimated from one path per tile, and pooled. Ones if the renderer does not count vertices.
-
-    Args:
-        problem, parameters: what to render.
-        uniform_table: table of these tiles with equal pixel probabilities.
-        key: key of the random numbers.
     """
     session = problem.renderer.prepare(list(parameters), None)
     if not isinstance(session, CountingSession):

@@ -75,13 +75,7 @@ class HeldElements:
 
 
 def bound_to(preconditioner: Any, topology: MeshTopology | None, columns: int) -> Any:
-    """Return a preconditioner for values at the vertices of a mesh, or with repeated border columns; itself for other parameters.
-
-    Args:
-        preconditioner: the preconditioner.
-        topology: mesh that carries the values; None for none.
-        columns: number of repeated columns at each end; 0 for none.
-    """
+    """Return a preconditioner for values at the vertices of a mesh, or with repeated border columns; itself for other parameters."""
     if isinstance(preconditioner, MeshPreconditioner) and topology is not None:
         return preconditioner.on_mesh(topology)
     if isinstance(preconditioner, PeriodicPreconditioner) and columns:

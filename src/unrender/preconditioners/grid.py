@@ -82,14 +82,8 @@ def transform(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Transform:
 
 @lru_cache(maxsize=16)
 def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0) -> TransformSolver:
-    """Return the cached solver of (I + λ L)^power y = x.
-
-    Args:
-        strength: λ, >= 0.
-        grid: number of cells per axis.
-        wrap: per axis, whether its two ends are neighbours.
-        power: exponent, > 0.
-    """
+    """Return the cached solver of (I + λ L)^power y = x on a grid of cells, whose ends are neighbours along axes that `wrap`; λ >= 0, power
+    > 0."""
     return TransformSolver(strength, grid, wrap, power)
 
 

@@ -196,13 +196,8 @@ class StrengthFit:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two successive gradients.
-
-    Attributes:
-        previous: the earlier gradient, preconditioned.
-        gradient: the later gradient, not preconditioned.
-        first, second: summaries of both without preconditioning, if `second` is not None.
-    """
+    """Two successive gradients: the earlier one preconditioned, the later one not, and, unless `second` is None, summaries of both
+    without."""
 
     previous: Array
     gradient: Array
