@@ -14,7 +14,7 @@ import pytest
 
 import unrender as ur
 from tiers import quick
-from unrender.rendering.mitsuba.camera_media import camera_media
+from unrender.rendering.mitsuba.camera_media import camera_media, unbounded_notices
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -93,6 +93,18 @@ def test_what_a_camera_says_itself_counts(caplog: pytest.LogCaptureFixture) -> N
     with caplog.at_level(logging.WARNING, "unrender"):
         assert inside_of(description) == [True, True]
     assert not caplog.records
+
+
+def test_a_medium_that_is_described_twice_has_the_border_of_its_shape() -> None:
+    """As the medium of a closed cube, and again as that of the camera and of a stone in it; without the cube it has no border."""
+    fog = {"type": "homogeneous", "sigma_t": 0.2, "albedo": 0.8}
+    bounded = scene(fog, {"inside": camera(INSIDE, medium=fog)})
+    bounded["stone"]["exterior"] = fog
+    assert not unbounded_notices(mi.load_dict(bounded, optimize=False))
+    outside = {**bounded, "outside": camera(OUTSIDE, medium=fog)}
+    assert len(unbounded_notices(mi.load_dict(outside, optimize=False))) == 1
+    del bounded["body"]
+    assert len(unbounded_notices(mi.load_dict(bounded, optimize=False))) == 1
 
 
 def test_a_camera_behind_the_walls_of_a_room_in_a_medium_is_found() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -24,6 +25,9 @@ _RAYS = 8
 _SURFACES = 64
 """Maximum number of surfaces that a ray passes before the boundary of a medium."""
 
+_MARGIN = 1e-3
+"""Distance of a ray's origin from a bounding box, relative to half of the longest side."""
+
 _AT_A_POINT = ("PerspectiveCamera", "ThinLensCamera", "RadianceMeter")
 
 
@@ -37,7 +41,7 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
     for index, sensor in enumerate(scene.sensors()):
         medium = sensor.get_medium()
         if medium is None and _may_be_inside(scene, sensor):
-            medium = _surrounding(scene, sensor)
+            medium = _surrounding(scene, _rays(sensor))
             if medium is not None and not quiet:
                 _log.warning(
                     "sensor %s: it names no medium, but is inside one, and is rendered inside it; mi.render would render it outside, so "
@@ -54,11 +58,16 @@ def unbounded_notices(scene: Any) -> list[str]:
     No free flight ends at infinity, but a connection to an environment has a finite length (two radii of the scene), and the MIS weight of
     the other strategy is lost.
     """
+    if scene.environment() is None:
+        return []
     shapes = all_shapes(scene)
-    outside = [*(sensor.get_medium() for sensor in scene.sensors()), *(shape.exterior_medium() for shape in shapes)]
-    inside = [shape.interior_medium() for shape in shapes]
-    endless = any(class_name(m) == "HomogeneousMedium" and m not in inside for m in outside if m is not None)
-    if scene.environment() is None or not endless:
+    inside = [medium for shape in shapes if (medium := shape.interior_medium()) is not None]
+    outside = [(sensor.get_medium(), partial(_rays, sensor)) for sensor in scene.sensors()]
+    outside += [(shape.exterior_medium(), partial(_outwards, shape.bbox())) for shape in shapes]
+    named = [(medium, rays) for medium, rays in outside if medium is not None and medium not in inside]
+    endless = [rays for medium, rays in named if class_name(medium) == "HomogeneousMedium"]
+    # A scene may describe one medium several times: as that of a closed shape, and as that of the sensors and objects in it.
+    if all(_surrounding(scene, rays()) in inside for rays in endless):
         return []
     return [
         "a medium without a border surrounds the scene, so paths reach the environment by emitter sampling alone: its brightness depends "
@@ -88,13 +97,25 @@ def _aperture_radius(lens: Any) -> float:
     return float(np.max(np.array(radius)))
 
 
-def _surrounding(scene: Any, sensor: Any) -> Any:
-    """Return the medium that most of the sensor's rays come from at their first medium boundary, or None."""
+def _rays(sensor: Any) -> Any:
+    """Return rays of a sensor through the whole of its film."""
     x, y = (np.mgrid[:_RAYS, :_RAYS].reshape(2, -1) + 0.5) / _RAYS
     position: Any = mi.Point2f(mi.Float(x), mi.Float(y))
     aperture: Any = mi.Point2f(mi.Float(y), mi.Float(x))
-    ray: Any = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), 0.5, position, aperture)[0]
-    active = mi.Bool(np.full(_RAYS**2, True))
+    return sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), 0.5, position, aperture)[0]
+
+
+def _outwards(box: Any) -> Any:
+    """Return rays from the middles of the faces of a bounding box, away from it."""
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    middle, half = np.array(box.center()).reshape(3), np.array(box.extents()).reshape(3) / 2.0
+    origins: Any = (middle + axes * (half + _MARGIN * half.max())).T
+    return mi.Ray3f(mi.Point3f(origins), mi.Vector3f(axes.T))
+
+
+def _surrounding(scene: Any, ray: Any) -> Any:
+    """Return the medium that most rays come from at their first medium boundary, or None."""
+    active = dr.full(mi.Bool, True, dr.width(ray))
     votes: Counter[int] = Counter()
     for _ in range(_SURFACES):
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
