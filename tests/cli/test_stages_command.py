@@ -422,3 +422,15 @@ def test_a_later_stage_begins_at_the_resolution_of_the_result_before() -> None:
     stage, found = stages_file.Stage("all", ("map",)), np.zeros((16, 16, 3), np.float32)
     assert problem._parameter("map", stage, None).coarse_to_fine == [50]
     assert problem._parameter("map", stage, found).coarse_to_fine is None
+
+
+@pytest.mark.slow
+def test_a_shared_setting_without_effect_in_a_stage_is_told(unrender: Unrender, staged: Path) -> None:
+    """It was dropped in silence, also where no stage has a use for it."""
+    head, _, _ = (staged / "stages.toml").read_text().partition('[[stages]]\nname = "light"')
+    head = head.replace('"plain"', '"auto"').replace("spp = 2, learning_rate = 0.02", "spp = 2, coarse = false")
+    (staged / "stages.toml").write_text(head)
+    answer = unrender(*RUN)
+    assert answer.status == 0, answer.error
+    assert "setting coarse=false: it has no effect in this stage, and is left out" in answer.out
+    assert "setting spp" not in answer.out

@@ -15,6 +15,7 @@ from unrender.core.errors import InputError
 from unrender.methods import effects
 from unrender.methods.base import Method, Options, method, methods
 from unrender.methods.plan import Plan
+from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import ParameterInfo
 
 OTHER: dict[str, Any] = {
@@ -155,6 +156,7 @@ def test_a_refusal_of_a_method_that_needs_no_problem_comes_before_it_is_loaded()
         (lambda: ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate(learn_from_draws=False)), "learn_from_draws has"),
         (lambda: ur.SmoothedDerivatives(0.1, joint=False), 'joint has no effect here; it needs order="hessian" or "hvp"'),
         (lambda: ur.SmoothedDerivatives(0.1, epsilon=0.1), "epsilon has no effect here"),
+        (lambda: dataclasses.replace(ur.SmoothedDerivatives(0.1, order="hvp", epsilon=0.1), order="gradient"), ", or its default 0.3"),
     ],
 )  # fmt: skip
 def test_fields_of_components_that_nothing_reads_are_refused(made: Any, line: str) -> None:
@@ -179,3 +181,23 @@ def test_options_of_a_registered_method_are_not_judged_by_how_its_parts_look() -
 def test_a_text_that_asks_for_the_default_in_other_words_is_no_option_without_effect(settings: dict[str, Any]) -> None:
     made = problem()
     assert method("smoothed").plan(made, settings).estimator is not None
+
+
+@pytest.mark.slow
+@pytest.mark.mitsuba
+def test_a_refusal_renders_little_more_than_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It planned every choice of every option anew, and each plan rendered pictures of other places: a minute for one line."""
+    made, count = ur.gallery.problem("mug", resolution=16), []
+    render = MitsubaSession.image_batch
+
+    def counted(*arguments: Any, **named: Any) -> Any:
+        count.append(0)
+        return render(*arguments, **named)
+
+    monkeypatch.setattr(MitsubaSession, "image_batch", counted)
+    method("auto").plan(made)
+    once = len(count)
+    with pytest.raises(InputError, match="has no effect"):
+        method("auto").plan(made, {"tolerance": "3"})
+    assert once > 0
+    assert len(count) <= 3 * once

@@ -86,6 +86,30 @@ def test_images_and_gradients_are_those_of_scenes_with_the_turned_light(kind: st
         assert difference(ur.render(ours, view=0, spp=4096), ur.render(ours, view=2, spp=4096)) > 0.03
 
 
+@pytest.mark.parametrize("ready_made", [False, True])
+def test_a_function_is_not_called_for_each_turn(ready_made: bool) -> None:
+    """It was called once for each copy of a camera. Only ready-made sensors, which two copies cannot share, need that."""
+    calls = []
+
+    def described() -> dict[str, Any]:
+        calls.append(0)
+        made = scene("directional")
+        return {**made, "camera_0": mi.load_dict(made["camera_0"])} if ready_made else made
+
+    counts = []
+    for turns in (2, 6):
+        calls.clear()
+        views = [ur.View(np.zeros((8, 8, 3)), known={ROTATION: [0.0, 0.1 * n, 0.0]}) for n in range(turns)]
+        made = ur.Problem(described, [ur.Parameter(COLOUR)], views, max_depth=3)
+        assert isinstance(made.renderer, MitsubaRenderer)
+        sensors: Any = made.renderer.pair.current.sensors()
+        assert len({id(sensor) for sensor in sensors}) == turns
+        opened: list[Any] = [mi.traverse(sensor)["shutter_open"] for sensor in sensors]
+        assert opened == list(range(turns))
+        counts.append(len(calls))
+    assert (counts[1] > counts[0]) == ready_made
+
+
 def test_views_that_differ_by_more_are_worlds_and_unknown_rotations_turn_the_light_as_described() -> None:
     turned = problem()
     views = [*turned.original_views, ur.View(np.zeros((8, 8, 3)), known={"light.scale": 2.0})]

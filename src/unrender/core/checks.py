@@ -135,7 +135,9 @@ def without_effect(component: Any, names: tuple[str, ...], needs: str) -> None:
     """Raise `InputError` for one of these fields of a dataclass that nothing reads and that differs from its default."""
     for field in dataclasses.fields(component):
         if field.name in names and getattr(component, field.name) != field.default:
-            raise InputError(f"{type(component).__name__}: {field.name} has no effect here; it needs {needs}")
+            raise InputError(
+                f"{type(component).__name__}: {field.name} has no effect here; it needs {needs}, or its default {field.default!r}"
+            )
 
 
 _log = logging.getLogger("unrender")

@@ -112,7 +112,7 @@ class Method:
     def plan(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Plan:
         """Return the plan for a problem, with `settings` in place of defaults. Raises `InputError`, also for one without effect."""
         options = self.configure(settings or {})
-        with self._named():
+        with self._named(), effects.measuring_once():
             plan = options.plan(problem)
             for name in settings or {}:
                 effects.check(options, name, lambda one: _decisions(one.plan(problem)), _decisions(plan))
@@ -121,7 +121,7 @@ class Method:
     def with_effect(self, problem: Problem, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings that change the plan for a problem. Raises `InputError`."""
         options = self.configure(settings)
-        with self._named():
+        with self._named(), effects.measuring_once():
             decide: effects.Decide = lambda one: _decisions(one.plan(problem))  # noqa: E731
             decided = decide(options)
             return {name: x for name, x in settings.items() if effects.has_effect(options, name, decide, decided)}

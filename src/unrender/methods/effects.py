@@ -1,10 +1,12 @@
-"""Options of a method that have no effect, because of other options or because of the problem."""
+"""Options of a method that have no effect, because of other options or because of the problem, and measurements that plans share."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
 
 import pydantic
 from pydantic import BaseModel
@@ -15,7 +17,31 @@ Decide = Callable[[Any], Any]
 """Function that returns what options decide, an object that `repr` shows in full. Raises `InputError` for incompatible options."""
 
 
+Measured = TypeVar("Measured")
+_measured: ContextVar[dict[Hashable, tuple[Any, Any]] | None] = ContextVar("measured", default=None)
+
 _NUMBER = re.compile(r"\d+(\.\d*)?(e[-+]?\d+)?")
+
+
+@contextmanager
+def measuring_once() -> Iterator[None]:
+    """Render for equal plans once: `measure` keeps its results within this block."""
+    before = _measured.set({})
+    try:
+        yield
+    finally:
+        _measured.reset(before)
+
+
+def measure(problem: Any, key: tuple[Hashable, ...], function: Callable[[], Measured]) -> Measured:
+    """Return a result that renders of a problem and `key` decide alone, within `measuring_once` the one of an equal call."""
+    known = _measured.get()
+    if known is None:
+        return function()
+    name = (id(problem), *key)
+    if name not in known:
+        known[name] = problem, function()  # with the problem, so that its id stays its own
+    return known[name][1]
 
 
 def check(options: BaseModel, name: str, decide: Decide, decided: Any) -> None:

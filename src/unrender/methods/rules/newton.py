@@ -19,6 +19,7 @@ from unrender.estimators.path import PathGradient
 from unrender.estimators.variable_projection import IMAGES, can_be_eliminated
 from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.methods import effects
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
 from unrender.methods.rules.starts import best_start, stands_out
@@ -101,7 +102,7 @@ def few_numbers(traits: Traits) -> Plan | None:
             return None
         # Noise hides what many lights explain; the loss smoothed over all of them rose.
         explained = traits.elements > constants.few_numbers or _explained(problem.initial(), problem, trial) > least
-        plateau = not (explained or stands_out(problem, traits.poses))
+        plateau = not (explained or effects.measure(problem, (stands_out,), lambda: stands_out(problem, traits.poses)))
     estimator = replace(estimator, shift=constants.pose_last_shift) if shapes else estimator
     why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
@@ -151,6 +152,12 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
 
 
 def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
+    """Return the result of `_predicted`, of equal arguments once for all plans of a check."""
+    key = (repr(estimator), *(arrays.numpy(value).tobytes() for value in first.values()))
+    return effects.measure(problem, key, lambda: _predicted(first, problem, estimator))
+
+
+def _predicted(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
     """Return the fraction of the loss that the quadratic model at some values predicts to remove.
 
     It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not bias it: gradients and images come from

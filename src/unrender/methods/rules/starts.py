@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.methods import effects
 from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations import Bounds
@@ -63,7 +64,13 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
     if not varied or (colours and not plateau):
         return plan
     initial = {key: u.initial if u.first is None else u.first for key, u in problem.unknowns.items()}
-    place = better_place(problem, FreshPictures(traits.problem, 0, _PATHS, _NUMBER), initial, varied, lights, plateau)
+    place = effects.measure(
+        traits.problem,
+        ("place", repr(plan.settings), *varied, *lights, plateau),
+        lambda: better_place(
+            problem, FreshPictures(traits.problem, 0, _PATHS, _NUMBER), initial, varied, lights, plateau
+        ),
+    )
     if place is None:
         return plan
     settings = {

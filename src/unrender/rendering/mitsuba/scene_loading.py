@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -82,15 +82,26 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict,
     return _with_sensor(scene), outline, equal
 
 
-def load_sensors(description: SceneDescription) -> list[mi.Sensor]:
-    """Return new sensors of a description that is known to load, without the rest of its scene."""
+def load_sensors(description: SceneDescription) -> Iterator[list[mi.Sensor]]:
+    """Yield new sensors of a description that is known to load, without the rest of its scene.
+
+    A function is called again only if what it returned holds ready-made sensors or films, which two sensors cannot share.
+    """
+    used: list[Any] = []
     described: Any = description() if callable(description) else description
-    parsed = loading.parse(described if isinstance(described, dict) else Path(described))
-    nodes = parsed.state.nodes
-    for name, child in references(nodes[0].props):
-        if nodes[child].type != mi.ObjectType.Sensor:
-            del nodes[0].props[name]
-    return list(parsed.instantiate().sensors())
+    while True:
+        parsed = loading.parse(described if isinstance(described, dict) else Path(described))
+        nodes = parsed.state.nodes
+        for name, child in references(nodes[0].props):
+            if nodes[child].type != mi.ObjectType.Sensor:
+                del nodes[0].props[name]
+        sensors = list(parsed.instantiate().sensors())
+        parts = [part for sensor in sensors for part in (sensor, sensor.film())]
+        if callable(description) and any(part is other for part in parts for other in used):
+            described, used = description(), []
+            continue
+        used += parts
+        yield sensors
 
 
 def _outline(description: dict[str, Any]) -> dict[str, Any]:

@@ -42,10 +42,10 @@ def with_turns(scene: Any, turns: Turns | None, description: SceneDescription) -
         return scene
     sensors = [*scene.sensors()]
     count = len(sensors)
-    copies: list[Sequence[Any]] = []
+    copies, more = list[Sequence[Any]](), load_sensors(description)
     for n, original in enumerate(turns.sensors[count:]):
         used = turns.sensors[count : count + n].count(original)
-        copies += [load_sensors(description)] if used == len(copies) else []
+        copies += [next(more)] if used == len(copies) else []
         sensors.append(copies[used][original])
     for row, sensor in enumerate(sensors):
         known: Any = mi.traverse(sensor)
