@@ -18,6 +18,7 @@ from tiers import quick
 from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba import geometry_notices
 from unrender.rendering.mitsuba.edges import edges_of
 from unrender.rendering.mitsuba.film import views_of
 from unrender.rendering.mitsuba.geometry_terms import BoundaryTerm
@@ -303,6 +304,23 @@ def test_a_mesh_that_touches_or_crosses_another_shape_is_told_once() -> None:
     stands = {"thing": meshes.triangles("thing", diamond, np.array(around), {"type": "diffuse"})}
     assert lines(-0.3, **stands) == []  # one point of it rests on the floor
     assert not [line for line in MitsubaRenderer(scene(), 2, ["thing.translation"]).notices if "touches" in line]
+
+
+def test_contact_is_looked_for_only_where_the_box_of_another_shape_meets_that_of_the_mesh(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched: list[Any] = []
+
+    def edges(mesh: Any, positions: Any) -> Any:
+        searched.append(mesh.id())
+        return edges_of(mesh, positions)
+
+    monkeypatch.setattr(geometry_notices, "edges_of", edges)
+    for height, expected in ((-0.6, []), (-0.35, ["thing"])):
+        described = scene()
+        described["floor"]["to_world"] = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90)
+        geometry_notices.contact_notices(mi.load_dict(described), [KEY])
+        assert searched == expected
 
 
 def test_a_mesh_that_views_show_in_mirrors_or_through_smooth_glass_is_told() -> None:

@@ -206,8 +206,8 @@ def _near(low: np.ndarray, high: np.ndarray) -> np.ndarray:
             break
         one, two = owner[same], owner[same + step]
         overlap = ((low[one] <= high[two]) & (low[two] <= high[one])).all(axis=1)
-        overlapping.append(np.stack([one, two], -1)[overlap])
-    return np.unique(np.concatenate(overlapping), axis=0) if overlapping else np.zeros((0, 2), int)
+        overlapping.append(one[overlap] * count + two[overlap])
+    return np.stack(np.divmod(np.unique(np.concatenate(overlapping or [np.zeros(0, int)])), count), -1)
 
 
 _HALVINGS = 3

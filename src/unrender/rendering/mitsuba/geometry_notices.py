@@ -27,19 +27,27 @@ def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
     The middle of an edge touches a shape on a normal of the edge's faces. Ends of edges do not count: they may meet a shape at one point.
     """
     lines = []
-    for mesh in _unknown_meshes(scene, keys):
+    for mesh in _unknown_meshes(scene, keys) if not has_instances(scene) else []:
+        points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
+        near = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+        low, high = (points.min(axis=0) - near, points.max(axis=0) + near) if len(points) else (np.inf, -np.inf)
         rest = [
             shape
             for shape in scene.shapes()
-            if shape is not mesh and not (_is_null(shape) and shape.interior_medium() is None)
+            if shape is not mesh
+            and not (_is_null(shape) and shape.interior_medium() is None)
+            and _meets(shape.bbox(), low, high).all()
         ]
-        edges = edges_of(mesh, None)
-        if not rest or not len(edges.ends) or has_instances(scene):
+        if not rest:
             continue
-        points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
-        start, along = points[edges.ends[:, 0]], points[edges.ends[:, 1]] - points[edges.ends[:, 0]]
-        near = _NEAR * np.linalg.norm(np.ptp(points, axis=0))
-        normals = [near * unit(np.cross(along, points[third] - start)) for third in edges.thirds.T]
+        edges = edges_of(mesh, None)
+        ends = points[edges.ends]
+        low, high = ends.min(axis=1) - near, ends.max(axis=1) + near
+        used = np.logical_or.reduce([_meets(shape.bbox(), low, high) for shape in rest])
+        if not used.any():
+            continue
+        start, along = ends[used, 0], ends[used, 1] - ends[used, 0]
+        normals = [near * unit(np.cross(along, points[third] - start)) for third in edges.thirds[used].T]
         rays = [(start + 0.05 * along, 0.9 * along), *((start + 0.5 * along + n, -2.0 * n) for n in normals)]
         origin, way = (np.concatenate(of) for of in zip(*rays, strict=True))
         ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(way.T))
@@ -53,6 +61,11 @@ def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
                 "a gap between them"
             )
     return lines
+
+
+def _meets(box: Any, low: Any, high: Any) -> np.ndarray:
+    """Return whether a bounding box meets boxes from `low` to `high`, (N, 3) or (3,)."""
+    return ((np.array(box.min) <= high) & (low <= np.array(box.max))).all(axis=-1)
 
 
 _SIDE, _HITS, _SHARE = 64, 6, 0.05
