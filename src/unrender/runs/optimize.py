@@ -54,7 +54,7 @@ def optimize(
     annotations: RunAnnotations | None = None,
     progress: bool | None = None,
 ) -> Result:
-    """Recover the problem's parameters by gradient-based optimisation.
+    """Recover the problem's parameters by gradient-based optimisation; return the best verified values with status and history.
 
     Args:
         problem: problem to solve.

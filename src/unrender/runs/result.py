@@ -141,8 +141,8 @@ class Result:
         """End of the run: "finished", "interrupted" or "failed".
 
         A run that used up its budget may also be "worse than start" (the final image is worse than the initial one), "memory disagrees"
-        (a control variate differs from a new image), or "does not fit" (the final image differs from the references, and more steps
-        are no answer).
+        (a control variate differs from a new image), or "does not fit" (the final image differs from the references
+        after enough steps).
         """
         if self.stopped in (INTERRUPTED, TERMINATED):
             return "interrupted"

@@ -180,7 +180,7 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         result.parameters, {key: np.ravel(error).tolist() for key, error in result.standard_error.items()}
     )
     for key, text in few.items():
-        table.add_row(f"= {escape(key)}", f"{text} (at the end)")
+        table.add_row(f"= {escape(key)}", text)
     start = problem.parameter_error(result.initial)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():
