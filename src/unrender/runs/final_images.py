@@ -31,6 +31,7 @@ from unrender.runs.final_checks import (
 )
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
+from unrender.runs.joint_maps import hidden_changes, untested_changes
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
@@ -149,7 +150,8 @@ def render_final_images(
         differs = _differs(problem, result, chosen, halves_of, samples, can_check)
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
-            lines, deviations = [*untested_factor(problem), *late.missing()], _without(deviations, late.unchecked)
+            deviations = _without(deviations, late.unchecked)
+            lines = [*untested_factor(problem), *untested_changes(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
@@ -158,9 +160,8 @@ def render_final_images(
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
-    deviations |= maps.standard_error
+    deviations = {} if differs else {**deviations, **maps.standard_error}
     if differs:
-        deviations = {}
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
     else:
         differs = differs_still(problem, result, chosen, ends, samples)
@@ -254,6 +255,7 @@ def _undetermined(
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
+    lines += hidden_changes(problem, result.parameters, per_pass, 2.0 * allowed, per_pass)
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])

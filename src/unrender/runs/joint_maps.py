@@ -1,0 +1,218 @@
+"""Detection of textures of one surface whose changes hide one another in the images."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.text import listed
+from unrender.runs.determination import change_of_images, changed
+from unrender.runs.image_sensitivity import (
+    MAP_AXES,
+    adjoint_spp,
+    adjoints,
+    derivative_session,
+    mask_roots,
+    neighbour_means,
+)
+from unrender.runs.numbers import TOO_SHORT
+from unrender.scene.bounds import off_ends
+from unrender.scene.problem import Problem
+from unrender.scene.render import as_tree, render, selected_views
+
+_HIDDEN = 0.35
+"""Root mean square change of the images by changes together, relative to the same changes alone, below which they hide one another."""
+_EXPECTED, _NAMED = 0.5, 0.2
+"""The same ratio by the derivatives, from which nothing is rendered; least part of a named texture, relative to the largest one."""
+_STEP, _TURN = 0.2, 0.02
+"""Size of the changes relative to those of `changed`, a fiftieth of the range; turn of normals, in units of a normal map."""
+_STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
+"""Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
+
+
+def hidden_changes(
+    problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float, per_pass: int | None = None
+) -> list[str]:
+    """Return a line for the textures of each surface whose changes hide one another, or that were not tested.
+
+    Each channel of a texture changes by a field f, such as a fiftieth of its range; a normal map turns along two tangents. With the
+    derivative J of the images, a cell has a matrix of the elements f · Jᵀ J f'. Its eigenvector of the least eigenvalue is the joint change
+    that the images show least. A line needs that these changes, rendered with other random numbers, change the images far less than alone.
+
+    Args:
+        values: {key: array} at the end of a run.
+        spp: samples per pixel of each rendering.
+        seconds: time limit of the test of a surface.
+        per_pass: see `render`.
+    """
+    lines = []
+    for keys in _surfaces(problem):
+        try:
+            lines += _Surface(problem, values, keys, spp, per_pass).line(seconds)
+        except InputError:  # the renderer rejects a value
+            continue
+    return lines
+
+
+def untested_changes(problem: Problem) -> list[str]:
+    """Return the lines of `hidden_changes` for a run that was too short for it."""
+    return [_untested(keys) for keys in _surfaces(problem)]
+
+
+def _untested(keys: Sequence[str]) -> str:
+    what = f"changes of {listed(keys)} hide" if len(keys) > 1 else f"turns of the normals of {keys[0]} hide"
+    return f"whether {what} one another: {TOO_SHORT}"
+
+
+def _surfaces(problem: Problem) -> Iterator[list[str]]:
+    """Yield the keys of the textures of each surface whose changes may hide one another; none for many views."""
+    known = problem.renderer.parameters()
+    if len(selected_views(problem)) < len(problem.views):
+        return
+    maps = [
+        key
+        for key, unknown in problem.unknowns.items()
+        if len(known[key].shape) == MAP_AXES and known[key].differentiable and unknown.prior is None
+    ]
+    for _, of in groupby(sorted(maps), key=lambda key: key.partition(".")[0]):
+        keys = list(of)
+        if len(keys) > 1 or known[keys[0]].role == "normal":
+            yield keys
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Textures of one surface, whose texels share the cells of the coarsest one; for the attributes, see `hidden_changes`."""
+
+    problem: Problem
+    values: Mapping[str, np.ndarray]
+    keys: Sequence[str]
+    spp: int
+    per_pass: int | None
+
+    def line(self, seconds: float) -> list[str]:
+        """Return the line; [] for none."""
+        problem, values, started = self.problem, self.values, time.perf_counter()
+        fields = [(key, field) for key in self.keys for field in self._fields(key)]
+        matrix = self._matrix(fields, seconds)
+        if matrix is None:
+            return [_untested(self.keys)]
+        height, width, count = matrix.shape[:3]
+        smooth = neighbour_means(matrix.reshape(height, width, -1), channels=True).reshape(matrix.shape)
+        if not np.isfinite(smooth).all():
+            return []
+        amounts = _aligned(np.linalg.eigh(smooth)[1][..., 0])
+        amounts /= np.abs(amounts).max(axis=-1, keepdims=True)
+        diagonal = np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1).sum(axis=(0, 1)), 0.0)
+        squares, parts = np.square(amounts).mean(axis=(0, 1)), {}
+        after = {key: np.array(values[key], np.float64) for key in self.keys}
+        for key in self.keys:
+            own = [index for index in range(count) if fields[index][0] == key]
+            # Turns of normals have no channels of their own, so both have the mean size.
+            sizes = np.full(len(own), squares[own].mean()) if self._is_normal(key) else squares[own]
+            parts[key] = float(sizes @ diagonal[own])
+            after[key] += sum(_spread(amounts[..., n], np.shape(values[key]))[..., None] * fields[n][1] for n in own)
+        total = sum(parts.values())
+        joint = float(np.einsum("hwi,hwij,hwj->", amounts, matrix, amounts))
+        named = [key for key, part in parts.items() if part > _NAMED**2 * max(parts.values())]
+        if not total > 0.0 or joint > _EXPECTED**2 * total or not (len(named) > 1 or self._is_normal(named[0])):
+            return []
+        moved = {
+            **values,
+            **{key: np.asarray(problem.unknowns[key].project(x), np.float32) for key, x in after.items()},
+        }
+        alone = total / (3.0 * sum(float(np.sum(problem.test_weights(view))) for view in range(len(problem.views))))
+        rendered = time.perf_counter()
+        change = change_of_images(problem, values, moved, _RENDERINGS * self.spp, self.per_pass)
+        now = time.perf_counter()
+        may_be = change.square < _HIDDEN**2 * alone < change.square + 2.0 * change.error
+        if may_be and now - started + _RENDERINGS * (now - rendered) < seconds:
+            change = change_of_images(problem, values, moved, _RENDERINGS**2 * self.spp, self.per_pass)
+        if not change.is_below(_HIDDEN, alone):
+            return []
+        ratio = f"{max(math.sqrt(max(change.square, 0.0) / alone), 0.01):.0%}"
+        advice = "use more lights or views"
+        if len(named) == 1:
+            return [
+                f"{named[0]}: some turns of its normals change the pictures by {ratio} of what others do; its values may be another "
+                f"solution: {advice}"
+            ]
+        return [
+            f"{listed(named)}: changes of one hide those of another; together they change the pictures by {ratio} of what they do alone; "
+            f"their values may be another solution: {advice}, or fix one of them"
+        ]
+
+    def _is_normal(self, key: str) -> bool:
+        return self.problem.renderer.parameters()[key].role == "normal"
+
+    def _fields(self, key: str) -> Iterator[np.ndarray]:
+        """Yield the change of each channel of a texture, or turns of its normals along two tangents."""
+        values = np.asarray(self.values[key], np.float32)
+        if not self._is_normal(key):
+            step = _STEP * (changed(self.problem, key, values, np.ones(values.shape)) - values)
+            yield from (step * (np.arange(step.shape[-1]) == channel) for channel in range(step.shape[-1]))
+            return
+        normals = 2.0 * values - 1.0
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
+        first = np.cross(normals, np.where(np.abs(normals[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+        first /= np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-6)
+        yield from (_TURN * first, _TURN * np.cross(normals, first))
+
+    def _matrix(self, fields: Sequence[tuple[str, np.ndarray]], seconds: float) -> np.ndarray | None:
+        """Return the matrix of each cell, (h, w, F, F); None if there is not enough time."""
+        problem, values, key = self.problem, self.values, Key(0, _STREAM)
+        views, started = range(len(problem.views)), time.perf_counter()
+
+        def pictures(of: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+            return [render(problem, of, view, self.spp, key.uint32(), self.per_pass) for view in views]
+
+        before = pictures(values)
+        if ((1 + _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (time.perf_counter() - started) > seconds:
+            return None
+        moved = [pictures({**values, name: np.asarray(values[name] + x, np.float32)}) for name, x in fields]
+        changes = [
+            np.nan_to_num(np.stack([of[view] - before[view] for of in moved]) * mask_roots(problem, view) ** 2)
+            for view in views
+        ]
+        session, keys = derivative_session(problem)
+        assert session is not None  # that of differentiable textures
+        tree, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
+        shape = tuple(min(np.shape(values[name])[axis] for name in self.keys) for axis in (0, 1))
+        matrix = np.zeros((len(fields), *shape, len(fields)))
+        for launch in range(1, 1 + _LAUNCHES):
+            seeds = {view: key.fold(launch).fold(view) for view in views}
+            of = adjoints(problem, session, tree, keys, spp, seeds, changes)
+            matrix += np.stack([_pooled((of[name] * x).sum(axis=-1), shape) for name, x in fields], axis=-1) / _LAUNCHES
+        matrix = np.moveaxis(matrix, 0, -2)
+        return 0.5 * (matrix + matrix.swapaxes(-1, -2))
+
+
+def _cells(size: int, count: int) -> np.ndarray:
+    return np.arange(size) * count // size
+
+
+def _pooled(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the sums (K, h, w) over the texels of each cell of values (K, H, W)."""
+    rows, columns = (_cells(size, count) for size, count in zip(values.shape[1:], shape, strict=True))
+    of_rows = np.stack([values[:, rows == row].sum(axis=1) for row in range(shape[0])], axis=1)
+    return np.stack([of_rows[..., columns == column].sum(axis=-1) for column in range(shape[1])], axis=-1)
+
+
+def _spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the values (h, w) of cells at the texels (H, W) of a texture."""
+    rows, columns = (_cells(size, count) for size, count in zip(shape[:2], values.shape, strict=True))
+    return values[rows[:, None], columns]
+
+
+def _aligned(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (H, W, F) with signs that bring them closest to one direction: those of eigenvectors are arbitrary."""
+    flat = vectors.reshape(-1, vectors.shape[-1])
+    main = np.linalg.eigh(flat.T @ flat)[1][:, -1]
+    return vectors * np.where(vectors @ main < 0.0, -1.0, 1.0)[..., None]

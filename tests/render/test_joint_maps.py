@@ -1,0 +1,88 @@
+"""Textures of one surface whose changes hide one another in the pictures are named, and determined ones are not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.runs.joint_maps import hidden_changes
+
+SIZE, TEXELS = 16, 8
+NORMALS, COLOUR = "wall.bsdf.normalmap.data", "wall.bsdf.nested_bsdf.reflectance.data"
+LAMPS = ([1.5, 1.0, 2.0], [-1.5, 1.0, 2.0], [0.0, -1.5, 2.0])
+
+
+def scene(*colours: Any) -> dict[str, Any]:
+    """A diffuse wall with bumps and a picture, before lamps of these colours."""
+    rng = np.random.default_rng(1)
+    normals = np.concatenate(
+        [0.5 + rng.uniform(-0.15, 0.15, (TEXELS, TEXELS, 2)), np.ones((TEXELS, TEXELS, 1))], axis=-1
+    )
+    picture = rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 3))
+    maps = [{"type": "bitmap", "bitmap": mi.Bitmap(x.astype(np.float32)), "raw": True} for x in (normals, picture)]
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    lamps = {
+        f"lamp{n}": {"type": "point", "position": place, "intensity": {"type": "rgb", "value": colour}}
+        for n, (place, colour) in enumerate(zip(LAMPS, colours, strict=False))
+    }
+    material = {"type": "normalmap", "normalmap": maps[0], "bsdf": {"type": "diffuse", "reflectance": maps[1]}}
+    return {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 36, "to_world": look, "film": film},
+        "wall": {"type": "rectangle", "bsdf": material},
+        **lamps,
+    }
+
+
+def problem(keys: tuple[str, ...], colours: list[Any], lit_apart: bool) -> ur.Problem:
+    """The wall in one picture, or in one of each lamp."""
+    reference = np.full((SIZE, SIZE, 3), 0.3, np.float32)
+    names = [f"lamp{n}.intensity.value" for n in range(len(colours))]
+    views = [ur.View(reference)]
+    if lit_apart:
+        views = [ur.View(reference, known={k: [9.0 * (k == name)] * 3 for k in names}) for name in names]
+    return ur.Problem(scene(*colours), [ur.Parameter(key) for key in keys], views, max_depth=2)
+
+
+WHITE, COLOURED = [[6.0] * 3] * 3, [[9.0, 0.5, 0.5], [0.5, 9.0, 0.5], [0.5, 0.5, 9.0]]
+
+
+@pytest.mark.parametrize(
+    ("keys", "colours", "lit_apart", "words"),
+    [
+        ((NORMALS, COLOUR), WHITE[:1], False, [f"{COLOUR}, {NORMALS}: changes of one hide those of another"]),
+        ((NORMALS, COLOUR), WHITE, True, []),
+        ((NORMALS,), WHITE[:1], False, [f"{NORMALS}: some turns of its normals change the pictures by"]),
+        ((NORMALS,), COLOURED, False, []),
+        ((COLOUR,), WHITE, False, []),
+    ],
+)
+def test_changes_that_hide_one_another_are_told(keys: Any, colours: Any, lit_apart: bool, words: list[str]):
+    """Three colours of a pixel determine a normal or a colour, not both; three pictures under one lamp each do."""
+    made = problem(keys, colours, lit_apart)
+    lines = hidden_changes(made, made.initial_values(), 16, math.inf)
+    assert [line[: len(start)] for line, start in zip(lines, words, strict=True)] == words
+
+
+def test_a_run_that_is_too_short_for_the_test_says_so():
+    made = problem((NORMALS, COLOUR), WHITE[:1], False)
+    assert [line.partition(":")[0] for line in hidden_changes(made, made.initial_values(), 16, 0.0)] == [
+        f"whether changes of {COLOUR}, {NORMALS} hide one another"
+    ]
+
+
+@pytest.mark.slow
+def test_the_end_of_a_run_names_them(tmp_path: Path):
+    keys = (NORMALS, COLOUR)
+    seen = ur.render(problem(keys, WHITE[:1], False), spp=64, seed=5)
+    unknowns = [ur.Parameter(key, initial=start) for key, start in zip(keys, ([0.5, 0.5, 1.0], 0.5), strict=True)]
+    made = ur.Problem(scene(*WHITE[:1]), unknowns, [ur.View(seen)], max_depth=2)
+    result = ur.optimize(made, steps=16, run_directory=tmp_path / "run")
+    assert result.undetermined[-1].startswith(f"{COLOUR}, {NORMALS}: changes of one hide those of another")
