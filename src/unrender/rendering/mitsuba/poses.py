@@ -96,6 +96,24 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     return result
 
 
+def axis_notices(scene: Any, unknown: Collection[str]) -> list[str]:
+    """Return a notice for each light with three unknown numbers of a rotation of which pictures show two, its direction.
+
+    The test at a run's end sees the third number, since turns about the light's axis are a curve of rotation vectors.
+    """
+    lines = []
+    for lamp in scene.emitters():
+        textures = {name for name, _ in mi.traverse(lamp) if name.startswith("texture.")} - {"texture.value"}
+        key = f"{lamp.id()}.rotation"
+        full = key in unknown or all(f"{key}.{axis}" in unknown for axis in _AXES)
+        if full and (lamp.class_name() == "DirectionalEmitter" or (lamp.class_name() == "SpotLight" and not textures)):
+            lines.append(
+                f"{key}: a turn of this light about its own axis changes no picture, so only its direction is determined, not its three "
+                "numbers, whatever their standard errors are; make two of them unknown"
+            )
+    return lines
+
+
 def _turns_smoothly(lamp: Any) -> bool:
     """Return whether the radiance of an emitter in a fixed direction is a continuous function of the emitter's rotation.
 
