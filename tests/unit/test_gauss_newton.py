@@ -193,15 +193,6 @@ def test_views_that_a_parameter_does_not_change_are_not_rendered() -> None:
     assert not estimate.hessian[:2, 2:].any()  # pyright: ignore[reportOptionalSubscript]
 
 
-@pytest.mark.parametrize(("largest", "passes"), [(1e-3, 1), (1e3, 3)])
-def test_first_widths_are_adapted_until_all_are_the_largest(largest: float, passes: int) -> None:
-    made = problem()
-    estimator = ur.GaussNewton(4, 2, largest=dict.fromkeys(START, largest))
-    estimate, state = estimator.estimate(made, START, estimator.init(made, START), Key(0))
-    assert (set(state.widths.values()) == {largest}) == (passes == 1)
-    assert estimate.info["samples"] == 20 * (4 + (passes + 1) * 2 * 2 * 3)
-
-
 def test_what_it_refuses() -> None:
     with pytest.raises(ur.InputError, match=r"coarse must be at least shift, 0\.3, got 0\.1"):
         ur.GaussNewton(coarse=0.1)

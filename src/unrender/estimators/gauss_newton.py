@@ -39,7 +39,7 @@ from unrender.scene.upsampling import Upsampler
 from unrender.statistics.scores import positive_inverse, scaled_eigh
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
-"""Maximum number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
+"""Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
 _BLIND = 0.3
 """Width up to which it grows while differences change no picture, relative to the parameter, or in its units if it is 0."""
 _SETTLED = 0.5
@@ -192,10 +192,8 @@ class GaussNewton:
             widths = {key: min(width, point.largest[key]) for key, width in widths.items()}
             state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
-                widths, system = state.widths, point.system(state, key.fold(1 + index))
+                system = point.system(state, key.fold(1 + index))
                 state = self._next(state, system, point, _FIRST_CHANGE)
-                if state.widths == widths and system.is_finite():  # the largest ones
-                    break
         step, moved = point.since(state.point, state)
         state = self._sharpened(state, point.theta, moved)
         state = replace(state, images=next_weight(state.images, moved)[1])
