@@ -128,3 +128,16 @@ def test_every_event_is_passed_on_and_undefined_ones_cost_nothing() -> None:
     both.on_step(run, record)
     assert run.shown_count == 1
     assert record == {"seen": True}
+
+
+@pytest.mark.parametrize("callbacks", [[3], None, print])
+def test_callbacks_of_another_kind_are_refused_in_one_line(callbacks: Any) -> None:
+    """They ended in an AttributeError or a TypeError within the run."""
+    with pytest.raises(ur.InputError, match="optimize: callbacks: expected a list of Callback objects, got"):
+        ur.optimize(problem(), steps=1, callbacks=callbacks)
+
+
+def test_a_path_in_place_of_a_problem_is_refused_in_one_line() -> None:
+    path: Any = "room.toml"
+    with pytest.raises(ur.InputError, match="optimize: expected a Problem, such as"):
+        ur.optimize(path, steps=1)

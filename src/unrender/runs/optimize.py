@@ -87,6 +87,7 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget is invalid; the run folder is in use, cannot
             be created, or cannot be written at the end; another thread has a run in progress.
     """
+    _check_kinds(problem, callbacks)
     plan = resolve(problem, estimator, optimizer)
     check(plan.estimator, plan.optimizer, steps, seconds)
     if checkpoint_every is not None:
@@ -100,6 +101,14 @@ def optimize(
     folder = _folder(run, annotations, run_directory, checkpoint_every)
     with _progress(progress) as bar, folder as writers, connected(run, [*bar, *callbacks], writers, annotations.phases):
         return descend(run)
+
+
+def _check_kinds(problem: Any, callbacks: Any) -> None:
+    """Raise `InputError` for a problem or callbacks of another kind."""
+    if not isinstance(problem, Problem):
+        raise InputError(f"optimize: expected a Problem, such as that of Problem.from_file, got {_shown(problem)}")
+    if not isinstance(callbacks, Sequence) or not all(isinstance(each, Callback) for each in callbacks):
+        raise InputError(f"optimize: callbacks: expected a list of Callback objects, got {callbacks!r:.80}")
 
 
 @contextmanager
