@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.runs.joint_maps import hidden_changes
+from unrender.core.text import listed
+from unrender.runs.joint_maps import hidden_changes, untested_changes
 
 SIZE, TEXELS = 16, 8
 NORMALS, COLOUR = "wall.bsdf.normalmap.data", "wall.bsdf.nested_bsdf.reflectance.data"
@@ -69,6 +70,30 @@ def test_changes_that_hide_one_another_are_told(keys: Any, colours: Any, lit_apa
     made = problem(keys, colours, lit_apart)
     lines = hidden_changes(made, made.initial_values(), 16, math.inf)
     assert [line[: len(start)] for line, start in zip(lines, words, strict=True)] == words
+
+
+def test_textures_of_shapes_whose_ids_have_dots_are_of_one_surface_each(tmp_path: Path):
+    """Blender names shapes Wall.001 and Wall.002; colours of the two hid one another in a scene without a fault."""
+    made = mi.Bitmap(np.full((4, 4, 3), [0.5, 0.5, 1.0], np.float32))
+    made.write(str(tmp_path / "map.exr"))
+    texture = '<texture name="{}" type="bitmap"><string name="filename" value="map.exr"/><boolean name="raw" value="true"/></texture>'
+    diffuse = f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>'
+    bumps = f'<bsdf type="normalmap">{texture.format("normalmap")}{diffuse}</bsdf>'
+    shapes = "".join(
+        f'<shape type="sphere" id="Wall.00{n}"><bsdf type="twosided">{bsdf}</bsdf></shape>'
+        for n, bsdf in enumerate((diffuse, diffuse, bumps))
+    )
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>'
+        f'<integer name="height" value="8"/></film></sensor>{shapes}<emitter type="constant"/></scene>'
+    )
+    keys = [f"Wall.00{n}.bsdf.brdf_0.reflectance.data" for n in range(2)]
+    both = [f"Wall.002.bsdf.brdf_0.{name}.data" for name in ("nested_bsdf.reflectance", "normalmap")]
+    found = ur.Problem(
+        tmp_path / "scene.xml", [ur.Parameter(key) for key in keys + both], [ur.View(np.zeros((8, 8, 3)))]
+    )
+    (line,) = untested_changes(found)
+    assert line.startswith(f"whether changes of {listed(both)} hide")
 
 
 def test_a_run_that_is_too_short_for_the_test_says_so():

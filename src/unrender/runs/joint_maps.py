@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
 
+_SLOT = re.compile(r"\.(?:(?:nested_)?b(?:sdf|rdf)(?:_\d+)?|emitter)\.")
+"""Name of a material within a shape or another material, or of a shape's emitter."""
 _HIDDEN = 0.35
 """Root mean square change of the images by changes together, relative to the same changes alone, below which they hide one another."""
 _EXPECTED, _NAMED = 0.5, 0.2
@@ -71,6 +74,11 @@ def _untested(keys: Sequence[str]) -> str:
     return f"whether {what} one another: {TOO_SHORT}"
 
 
+def _surface_of(key: str) -> str:
+    """Return the id of the shape or material of a texture's key. An id may have dots, as Blender's Cube.001."""
+    return _SLOT.split(key, maxsplit=1)[0] if _SLOT.search(key) else key.rsplit(".", 2)[0]
+
+
 def _surfaces(problem: Problem) -> Iterator[list[str]]:
     """Yield the keys of the textures of each surface whose changes may hide one another; none for many views."""
     known = problem.renderer.parameters()
@@ -81,8 +89,8 @@ def _surfaces(problem: Problem) -> Iterator[list[str]]:
         for key, unknown in problem.unknowns.items()
         if len(known[key].shape) == MAP_AXES and known[key].differentiable and unknown.prior is None
     ]
-    for _, of in groupby(sorted(maps), key=lambda key: key.partition(".")[0]):
-        keys = list(of)
+    for _, of in groupby(sorted(maps, key=_surface_of), key=_surface_of):
+        keys = sorted(of)
         if len(keys) > 1 or known[keys[0]].role == "normal":
             yield keys
 
