@@ -110,6 +110,16 @@ def test_a_function_is_not_called_for_each_turn(ready_made: bool) -> None:
     assert (counts[1] > counts[0]) == ready_made
 
 
+@pytest.mark.parametrize("function", [False, True])
+def test_a_sensor_that_turned_views_would_share_is_refused(function: bool) -> None:
+    """All views were rendered under the light of the last one."""
+    made = scene("directional")
+    made["camera_0"] = mi.load_dict(made["camera_0"])
+    views = [ur.View(np.zeros((8, 8, 3)), known={ROTATION: vector}) for vector in TURNS]
+    with pytest.raises(ur.InputError, match="sensor camera_0 is a ready-made Mitsuba object, which views that turn"):
+        ur.Problem((lambda: made) if function else made, [ur.Parameter(COLOUR)], views, max_depth=3)
+
+
 def test_views_that_differ_by_more_are_worlds_and_unknown_rotations_turn_the_light_as_described() -> None:
     turned = problem()
     views = [*turned.original_views, ur.View(np.zeros((8, 8, 3)), known={"light.scale": 2.0})]

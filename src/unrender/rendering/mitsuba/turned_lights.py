@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.scene_graph import scene_of
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, load_sensors
@@ -46,7 +47,12 @@ def with_turns(scene: Any, turns: Turns | None, description: SceneDescription) -
     for n, original in enumerate(turns.sensors[count:]):
         used = turns.sensors[count : count + n].count(original)
         copies += [next(more)] if used == len(copies) else []
-        sensors.append(copies[used][original])
+        if (copied := copies[used][original]) in sensors:
+            raise InputError(
+                f"scene: sensor {copied.id() or original} is a ready-made Mitsuba object, which views that turn lights would share; "
+                "give its dictionary, or a function that makes a new one each time"
+            )
+        sensors.append(copied)
     for row, sensor in enumerate(sensors):
         known: Any = mi.traverse(sensor)
         known["shutter_open"] = float(row)
