@@ -14,6 +14,7 @@ import pytest
 
 import unrender as ur
 from tiers import quick
+from unrender.rendering.mitsuba import camera_media as camera_media_module
 from unrender.rendering.mitsuba.camera_media import camera_media, unbounded_notices
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -105,6 +106,18 @@ def test_a_medium_that_is_described_twice_has_the_border_of_its_shape() -> None:
     assert len(unbounded_notices(mi.load_dict(outside, optimize=False))) == 1
     del bounded["body"]
     assert len(unbounded_notices(mi.load_dict(bounded, optimize=False))) == 1
+
+
+def test_a_medium_that_many_objects_describe_costs_one_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each object had a search of its own: 300 stones took 17 s before the first step, now 0.3 s."""
+    fog, listed = {"type": "homogeneous", "sigma_t": 0.2, "albedo": 0.8}, []
+    described = scene(fog, {"inside": camera(INSIDE, medium=fog)})
+    for n in range(9):
+        described[f"stone{n}"] = {"type": "sphere", "center": [0.1 * n, 0.0, 0.0], "radius": 0.02, "exterior": fog}
+    media = camera_media_module.media
+    monkeypatch.setattr(camera_media_module, "media", lambda found: listed.append(0) or media(found))
+    assert not unbounded_notices(mi.load_dict(described, optimize=False))
+    assert len(listed) == 1
 
 
 def test_a_camera_behind_the_walls_of_a_room_in_a_medium_is_found() -> None:

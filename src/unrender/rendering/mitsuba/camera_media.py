@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -37,18 +38,18 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
     A sensor's own `medium` takes precedence. Without one, its rays are traced to their first medium boundary, and the medium that most of
     them come from is the sensor's. A warning is logged for each of these, unless `quiet`.
     """
-    result = []
-    for index, sensor in enumerate(scene.sensors()):
-        medium = sensor.get_medium()
-        if medium is None and _may_be_inside(scene, sensor):
-            medium = _surrounding(scene, _rays(sensor))
-            if medium is not None and not quiet:
+    sensors = scene.sensors()
+    result = [sensor.get_medium() for sensor in sensors]
+    searched = [n for n, sensor in enumerate(sensors) if result[n] is None and _may_be_inside(scene, sensor)]
+    for index, medium in zip(searched, _surrounding(scene, [_rays(sensors[n]) for n in searched]), strict=True):
+        if medium is not None:
+            result[index] = medium
+            if not quiet:
                 _log.warning(
                     "sensor %s: it names no medium, but is inside one, and is rendered inside it; mi.render would render it outside, so "
                     "give the sensor this medium before you render references",
-                    sensor.id() or index,
+                    sensors[index].id() or index,
                 )
-        result.append(medium)
     return result
 
 
@@ -67,7 +68,7 @@ def unbounded_notices(scene: Any) -> list[str]:
     named = [(medium, rays) for medium, rays in outside if medium is not None and medium not in inside]
     endless = [rays for medium, rays in named if class_name(medium) == "HomogeneousMedium"]
     # A scene may describe one medium several times: as that of a closed shape, and as that of the sensors and objects in it.
-    if all(_surrounding(scene, rays()) in inside for rays in endless):
+    if all(medium in inside for medium in _surrounding(scene, [rays() for rays in endless])):
         return []
     return [
         "a medium without a border surrounds the scene, so paths reach the environment by emitter sampling alone: its brightness depends "
@@ -113,10 +114,16 @@ def _outwards(box: Any) -> Any:
     return mi.Ray3f(mi.Point3f(origins), mi.Vector3f(axes.T))
 
 
-def _surrounding(scene: Any, ray: Any) -> Any:
-    """Return the medium that most rays come from at their first medium boundary, or None."""
-    active = dr.full(mi.Bool, True, dr.width(ray))
-    votes: Counter[int] = Counter()
+def _surrounding(scene: Any, rays: Sequence[Any]) -> list[Any]:
+    """Return for each bundle of rays the medium that most of them come from at their first medium boundary, or None."""
+    if not rays:
+        return []
+    bundle = np.repeat(np.arange(len(rays)), [dr.width(each) for each in rays])
+    parts = [[np.broadcast_to(np.array(part), (3, dr.width(each))) for part in (each.o, each.d)] for each in rays]
+    origins, ways = (np.concatenate(of, axis=1) for of in zip(*parts, strict=True))
+    ray: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))
+    active = dr.full(mi.Bool, True, len(bundle))
+    votes = [Counter[int]() for _ in rays]
     for _ in range(_SURFACES):
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         meets = active & si.is_valid() & si.is_medium_transition()
@@ -124,13 +131,12 @@ def _surrounding(scene: Any, ray: Any) -> Any:
         active &= si.is_valid() & ~meets
         ray = si.spawn_ray(ray.d)
         dr.eval(meets, before, active, ray)
-        votes.update(np.array(before)[np.array(meets)].tolist())
+        for index, number in zip(bundle[np.array(meets)], np.array(before)[np.array(meets)].tolist(), strict=True):
+            votes[index][number] += 1
         if not dr.any(active):
             break
-    if not votes:
-        return None
-    number = votes.most_common(1)[0][0]
-    return next((medium for medium in media(scene) if medium_id(medium) == number), None)
+    known = {medium_id(medium): medium for medium in dict.fromkeys(media(scene))}
+    return [known.get(each.most_common(1)[0][0]) if each else None for each in votes]
 
 
 def medium_id(medium: Any) -> int:
