@@ -186,19 +186,28 @@ def test_a_posed_light_shines_as_if_it_had_been_moved(kind: str) -> None:
     assert np.abs(still - expected).mean() > 0.03 * scale, "a light that stands still went unseen"
 
 
+AXES = ["lamp.rotation.x", "lamp.rotation.y", "lamp.rotation.z"]
+OF_FUNCTION = {"lamp.rotation": lambda known: 0.1 * np.ones(3, np.float32) * known["turn"]}
+
+
 @pytest.mark.parametrize(
-    ("kind", "parts", "told"),
+    ("kinds", "unknowns", "expressions", "told"),
     [
-        ("directional", [""], True),
-        ("spot", [".x", ".y", ".z"], True),
-        ("spot", [".x", ".z"], False),
-        ("projector", [""], False),
+        (["directional"], [ur.Parameter(AXES[0][:-2])], {}, True),
+        (["spot"], [ur.Parameter(key) for key in AXES], {}, True),
+        (["spot"], [ur.Parameter(key) for key in AXES[::2]], {}, False),
+        (["projector"], [ur.Parameter(AXES[0][:-2])], {}, False),
+        (["directional"], [ur.Parameter(AXES[0][:-2], prior={"near": 0.0, "std": 0.1})], {}, False),
+        (["directional", "spot"], [ur.Parameter("rig", keys=["lamp.rotation", "lamp1.rotation"])], {}, False),
+        (["directional"], [ur.Parameter("turn", initial=1.0)], OF_FUNCTION, False),
     ],
 )
-def test_three_numbers_of_a_turn_that_has_two_are_told(kind: str, parts: list[str], told: bool) -> None:
-    """A run with a directional light ended 9 standard errors from the truth in the third number."""
-    renderer = MitsubaRenderer(scene(light(kind)), 3, [f"lamp.rotation{part}" for part in parts])
-    assert any("about its own axis" in notice for notice in renderer.notices) is told
+def test_three_numbers_of_a_turn_that_has_two_are_told(kinds: Any, unknowns: Any, expressions: Any, told: bool) -> None:
+    """A run with a directional light ended 9 standard errors from the truth in the third number. One turn of two lights has three."""
+    more = {f"lamp{n}": light(kind) for n, kind in enumerate(kinds) if n}
+    reference = np.full((12, 12, 3), 0.5, np.float32)
+    made = ur.Problem({**scene(light(kinds[0])), **more}, unknowns, [ur.View(reference)], expressions=expressions)
+    assert any("about its own axis" in notice for notice in made.notices) is told
 
 
 def test_states_of_a_batch_and_what_is_left_out_again() -> None:

@@ -51,7 +51,7 @@ class ParameterInfo:
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
         scattering: what it changes the form of: a "bsdf", as a roughness does, not a colour, or a "medium"; else "".
         length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
-        angle: whether its values are angles in radians.
+        angle, axial: whether its values are angles in radians; whether they turn a light whose own axis no picture shows.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
         of_expression: whether expressions read it, which may be nonlinear.
     """
@@ -78,6 +78,7 @@ class ParameterInfo:
     nonlinear: bool = False
     scattering: Literal["", "bsdf", "medium"] = ""
     angle: bool = False
+    axial: bool = False
     lobe: bool = False
     of_expression: bool = False
     length: float = 1.0

@@ -90,6 +90,7 @@ class Tie:
             singular=next(iter(singular), None),
             resizable=all(info.resizable for info in infos),
             light=all(info.light for info in infos),
+            axial=False,  # lights of different directions determine a turn of all together
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
             of_expression=any(info.of_expression for info in infos),
             length=max(info.length for info in infos),

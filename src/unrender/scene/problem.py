@@ -31,6 +31,7 @@ from unrender.scene.references import References, ViewLosses, likelihood_scale
 from unrender.scene.surfaces import Surface
 from unrender.scene.validation import (
     Bounds,
+    axis_notices,
     check_loss,
     check_loss_function,
     check_max_depth,
@@ -151,6 +152,7 @@ class Problem(ViewLosses):
             notices=[
                 *renderer_notices(renderer),
                 *unknown_notices,
+                *axis_notices(unknowns, renderer.parameters()),
                 *known_angles(original_views, renderer.parameters()),
                 *view_notices,
             ],

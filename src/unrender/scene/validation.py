@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -363,6 +364,20 @@ def _check_files(scene: Path) -> None:
 def renderer_notices(renderer: Renderer) -> Sequence[str]:
     """Return a renderer's deviations from its scene, one line each; a renderer need not report any."""
     return renderer.notices if isinstance(renderer, _Noticing) else ()
+
+
+def axis_notices(unknowns: Mapping[str, Unknown], known: Mapping[str, ParameterInfo]) -> list[str]:
+    """Return a notice for each light with three unknown numbers of a rotation of which the pictures show two, its direction."""
+    # The test at a run's end sees the third number, since turns about that axis are a curve of rotation vectors.
+    free, counts = [key for key in unknowns if known[key].axial and unknowns[key].prior is None], Counter[str]()
+    for key in free:
+        counts[key if known[key].shape else key.rpartition(".")[0]] += math.prod(known[key].shape)
+    return [
+        f"{key}: a turn of this light about its own axis changes no picture, so only its direction is determined, not its three numbers, "
+        "whatever their standard errors are; make two of them unknown, those of axes across its direction"
+        for key, count in counts.items()
+        if count == 3
+    ]
 
 
 def check_sequence(values: Any, kind: type, name: str) -> tuple[Any, ...]:

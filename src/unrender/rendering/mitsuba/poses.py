@@ -55,6 +55,7 @@ class PoseKey:
         axis: 0 to 2, or None for all.
         light: whether the target emits light.
         smooth: whether it changes the radiance of a light continuously, and no path, so that path replay gives its derivative.
+        axial: see `ParameterInfo`.
     """
 
     target: str
@@ -62,6 +63,7 @@ class PoseKey:
     axis: int | None
     light: bool = False
     smooth: bool = False
+    axial: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -83,35 +85,25 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     targets += [(sensor.id(), _MOTIONS, False) for sensor in scene.sensors() if sensor.get_shape() is None]
     counts = Counter(target for target, _, _ in targets)
     turning = {lamp.id() for lamp in lamps if _turns_smoothly(lamp)}
+    axial = {lamp.id() for lamp in lamps if _has_axis(lamp)}
     result: dict[str, PoseKey] = {}
     for target, parts, light in targets:
         if _NAMELESS.fullmatch(target) or counts[target] > 1:
             continue
         for part in parts:
-            key, smooth = f"{target}.{part}", part == "rotation" and target in turning
-            result[key] = PoseKey(target, part, None, light, smooth)
+            key, kinds = f"{target}.{part}", [part == "rotation" and target in of for of in (turning, axial)]
+            result[key] = PoseKey(target, part, None, light, *kinds)
             if part != "scale":
                 for axis, name in enumerate(_AXES):
-                    result[f"{key}.{name}"] = PoseKey(target, part, axis, light, smooth)
+                    result[f"{key}.{name}"] = PoseKey(target, part, axis, light, *kinds)
     return result
 
 
-def axis_notices(scene: Any, unknown: Collection[str]) -> list[str]:
-    """Return a notice for each light with three unknown numbers of a rotation of which pictures show two, its direction.
-
-    The test at a run's end sees the third number, since turns about the light's axis are a curve of rotation vectors.
-    """
-    lines = []
-    for lamp in scene.emitters():
-        textures = {name for name, _ in mi.traverse(lamp) if name.startswith("texture.")} - {"texture.value"}
-        key = f"{lamp.id()}.rotation"
-        full = key in unknown or all(f"{key}.{axis}" in unknown for axis in _AXES)
-        if full and (lamp.class_name() == "DirectionalEmitter" or (lamp.class_name() == "SpotLight" and not textures)):
-            lines.append(
-                f"{key}: a turn of this light about its own axis changes no picture, so only its direction is determined, not its three "
-                "numbers, whatever their standard errors are; make two of them unknown"
-            )
-    return lines
+def _has_axis(lamp: Any) -> bool:
+    """Return whether turns of an emitter about its own direction change no picture."""
+    if lamp.class_name() != "SpotLight":
+        return lamp.class_name() == "DirectionalEmitter"
+    return not {name for name, _ in mi.traverse(lamp) if name.startswith("texture.")} - {"texture.value"}
 
 
 def _turns_smoothly(lamp: Any) -> bool:
@@ -165,6 +157,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -
         viewpoint=viewpoint,
         sensor=sensor,
         angle=key.part == "rotation",
+        axial=key.axial,
         length=length if key.part == "translation" else 1.0,
     )
 

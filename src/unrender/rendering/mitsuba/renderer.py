@@ -100,7 +100,6 @@ class MitsubaRenderer:
             *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
             *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
             *unbounded_notices(self.pair.current),
-            *poses.axis_notices(self.pair.current, keys),
             *contact_notices(self.pair.current, keys),
             *specular_notices(self.pair.current, keys),
             *shadow_notices(self.pair.current, keys),
