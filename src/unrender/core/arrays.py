@@ -209,7 +209,7 @@ def add_rows(x: Array, index: Array, count: int) -> Array:
 
 def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
     """Return the sums of consecutive rows of `x` (N, C) for P segments, (P, C), by their first rows, ascending, and numbers of rows, >= 1.
-    The order of summation is fixed."""
+    Each row is in one segment. The order of summation is fixed."""
     if not is_drjit(x):
         return np.add.reduceat(x, starts, axis=0)
     width, kind, values = x.shape[1], type(starts), x.array

@@ -30,7 +30,7 @@ def pad(x: np.ndarray, columns: int) -> np.ndarray:
 
 
 def repeat(x: Array, columns: int) -> Array:
-    """Overwrite the outer columns of an array (H, W + 2 `columns`, C) with copies of the columns that they repeat."""
+    """Overwrite the outer columns of an array (H, W + 2 `columns`, C) with copies of the columns that they repeat; itself for 0 columns."""
     if not columns:
         return x
     shape = arrays.shape(x)

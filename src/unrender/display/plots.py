@@ -34,7 +34,8 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """A map from values to [0, 1], linear or logarithmic, with ticks (value, label); `low` and `high` are the values at 0 and 1."""
+    """A map from values to [0, 1], linear or logarithmic, with ticks (value, label); `low` and `high` are the values at 0 and 1,
+    positive if logarithmic."""
 
     low: float
     high: float

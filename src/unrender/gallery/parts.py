@@ -50,8 +50,8 @@ def cameras_around(
 
 
 def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Return a rectangle that faces `right` × `up`, perpendicular vectors to the midpoints of two edges; a texture is upright when viewed
-    from its front."""
+    """Return a rectangle that faces `right` × `up`, perpendicular vectors from the centre to the midpoints of two edges. A texture is
+    upright when viewed from its front."""
     x, y = np.asarray(right, float), np.asarray(up, float)
     normal = np.cross(x, y)
     matrix = np.eye(4)
@@ -93,7 +93,8 @@ def light(*rgb: float) -> dict[str, Any]:
 
 
 def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> dict[str, Any]:
-    """Return a closed room, x and y in [-1, 1], z in [-1, 2.2], with walls that face inward: `walls` are back, front, floor and ceiling."""
+    """Return a closed room, x and y in [-1, 1], z in [-1, 2.2], with walls that face inward. `walls` is the material of back, front,
+    floor and ceiling."""
     return {
         "back": rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), walls),
         "left": rectangle((-1, 0, 0.6), (0, 0, -1.6), (0, 1, 0), left),
@@ -246,8 +247,9 @@ def mix(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dict[str, Any]:
-    """Return a differentiable texture of values (H, W, C) or (H, W), whose first row is at the top (v = 1). With `repeat`, it is at v = 0,
-    and every other copy is mirrored, so that there are no seams."""
+    """Return a differentiable texture of values (H, W, C) or (H, W), whose first row is at the top (v = 1).
+
+    With `repeat` copies in u and in v, it is at v = 0, and every other copy is mirrored, so that there are no seams."""
     pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], dtype=np.float32)
     if repeat is None:
         wrap, to_uv = "clamp", mi.ScalarTransform4f().translate([0, 1, 0]) @ mi.ScalarTransform4f().scale([1, -1, 1])

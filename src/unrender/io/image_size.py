@@ -38,8 +38,8 @@ _FARTHEST = 1 << 30
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a picture file: its kind, such as "PNG", and width, height and channels of each part. Others than PNG and TIFF have 0 bits
-    per channel and the orientation 1."""
+    """Header of a picture file: its kind, such as "PNG", and width, height and channels of each part. Bits per channel are 0 for others
+    than PNG and TIFF, and the orientation is 1 for others than TIFF."""
 
     kind: str
     sizes: Sizes

@@ -49,8 +49,8 @@ class References:
         return arrays.like_integers(np.array([view.sensor for view in self._views]), self._array(np.zeros(1)))
 
     def at(self, views: Array, pixels: Array) -> tuple[Array, Array]:
-        """Return the reference values (N, 3) of these pixels of views, and the factors of their losses (N, 1): weight * mask / (H * W *
-        3)."""
+        """Return the reference values (N, 3) of these row-major pixels of views, and the factors of their losses (N, 1): weight * mask /
+        (H * W * 3)."""
         if self.in_host_memory:
             return self._from_host(arrays.numpy(views), arrays.numpy(pixels))
         row = self.rows(views, pixels)

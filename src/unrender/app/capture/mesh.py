@@ -164,8 +164,8 @@ def check_atlas_installed() -> None:
 def unwrap(mesh: Mesh, resolution: int, seconds: float = _SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
     """Return the mesh with texture coordinates: one atlas without overlaps, with charts about 2 of `resolution` texels apart.
 
-    Vertices on seams are duplicated. Normals do not change. Raises `InputError` if xatlas is not installed, fails, or exceeds the time
-    limit.
+    Vertices on seams are duplicated. Normals do not change. Two file names are appended to the `command` of the subprocess. Raises
+    `InputError` if xatlas is not installed, fails, or exceeds the limit of `seconds`.
     """
     check_atlas_installed()
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2

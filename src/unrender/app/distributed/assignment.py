@@ -95,7 +95,7 @@ def needed(problem: Problem, views: Sequence[int], has_memory: bool) -> tuple[di
 
 
 def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tuple[str, int]], has_memory: bool) -> None:
-    """Raise `InputError` if a share does not fit its (machine, bytes available, 0 for unknown), stating its size and what would fit."""
+    """Raise `InputError` if a share does not fit, stating its size and what would fit. `free`: (machine, bytes or 0 if unknown) of each."""
     for views, (where, room) in zip(shares, free, strict=True):
         parameters, images = needed(problem, views, has_memory)
         if not room or sum(parameters.values()) + images <= room:

@@ -64,7 +64,7 @@ class EdgeTable:
     """Edges of all meshes of a scene: `count` in all, first the `moving` ones, of shapes that move.
 
     Vertices at the same position are merged to match faces, so seams of texture coordinates are not borders. `loaded` has positions {id: (3
-    V,)} to match faces by, if a mesh may have other ones by now. Triangles without area have no edges.
+    V,)} to match faces by, if a mesh may have other ones by now. Triangles without area have no edges. `lit`: a moving shape emits light.
     """
 
     def __init__(self, scene: Any, moving: AbstractSet[str], loaded: Mapping[str, np.ndarray] | None = None):

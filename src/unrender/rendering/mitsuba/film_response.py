@@ -22,7 +22,9 @@ _STEP = 5.0
 
 @dataclass
 class SpectralSamples:
-    """Radiance of paths in a spectral variant: weighted samples of the film; and, for a replay, unweighted radiance at the wavelengths."""
+    """Radiance of paths in a spectral variant: weighted samples of the film; and, for a replay, unweighted radiance at the wavelengths.
+
+    It is a dataclass, which recorded kernels carry."""
 
     film: Any
     spectrum: Any

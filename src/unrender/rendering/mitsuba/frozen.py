@@ -109,7 +109,9 @@ _INDEPENDENT = "the argument does not depend on the input variable"
 
 
 class FrozenFunction:
-    """A function that Dr.Jit records at its first call and replays at later ones. If it is not `recordable`, it is traced at each call.
+    """A function that Dr.Jit records at its first call and replays at later ones. It is traced at each call if it cannot be recorded.
+
+    A function may be called again after it failed. One that is not `recordable` is never recorded.
 
     A virtual call sees the objects of every scene in the process, including the caller's own. Some of them build tables at their first use,
     which cannot be recorded. Those of textured lights are built before the first recording. The traced call after a failure builds others,

@@ -329,7 +329,7 @@ class MitsubaRenderer:
 
 class StockSession:
     """A load of the scene for `mi.render` alone, with the scene's own film and reconstruction filter, by `prbvolpath` if `volumetric`, else
-    `prb`."""
+    `prb`. Moving spheres become meshes."""
 
     def __init__(self, description: SceneDescription, moving: AbstractSet[str], volumetric: bool, paths: LightPaths):
         self._loaded = LoadedScene(description, moving)

@@ -187,8 +187,8 @@ class BoundaryIntegrator:
     def _draw(
         self, picture: Picture, positions: Any, seed: int, most: int, emitters: Any = None
     ) -> tuple[Any, Any, BoundarySegment, EyePath, Any]:
-        """Sample edges, by length and solid angle of their directions, a point of each and a direction; `most` vertices between x_a and the
-        sensor.
+        """Sample edges, by length and solid angle of their directions, a point of each and a direction; at most `most` vertices between x_a
+        and the sensor.
 
         Edges of emitter id 0 are left out. Returns indices of edges, attached points, segments, eye paths, and the reciprocal density.
         """

@@ -154,9 +154,9 @@ class BoundarySegment:
 
 
 class EyePath:
-    """Subpath from x_a, behind an edge point, to the sensor: `bounces` intermediate vertices, a random number, and one more segment.
+    """Subpath from x_a, behind an edge point, to the sensor, with a random number `bounces` of intermediate vertices.
 
-    `moved` is x_a as hit by a ray from the sensor's side, attached. The throughput is importance over density.
+    `moved` is x_a as hit by a ray from the sensor's side, attached. The throughput is importance over density; the position is in pixels.
     """
 
     def __init__(self, picture: Picture, segment: BoundarySegment, sampler: Any, most: int, active: Any):
