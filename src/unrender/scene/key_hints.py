@@ -11,6 +11,7 @@ from unrender.rendering.renderer import ParameterInfo
 
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
 """Ids that Mitsuba generates for objects without one."""
+_OBJECT = re.compile(r"([^.]*(?:\.\d+)*)\.")
 _TRANSFORM = "to_world"
 _INSIDE = "nested_texture"
 """Slot of the texture of a bump map, which its scale multiplies."""
@@ -45,18 +46,19 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     An object without an `id` has no usable key. If the scene has such an object with a parameter of that name, the hint asks for an id.
     """
     able = [name for name, info in known.items() if info.differentiable or info.perturbable]
-    owner, _, rest = key.partition(".")
-    if rest and owner not in {name.partition(".")[0] for name in known}:
+    owner, rest = _split(key)
+    owners = {_split(name)[0] for name in known}
+    if rest and owner not in owners:
         similar = [name for name in known if name.endswith("." + rest)]
         nameless = [name for name in similar if _is_nameless(name)]
-        close = did_you_mean(owner, {name.partition(".")[0] for name in similar if not _is_nameless(name)})
+        close = did_you_mean(owner, {_split(name)[0] for name in similar if not _is_nameless(name)})
         if nameless and not close:
             others = "" if len(nameless) == 1 else f" ({len(nameless)} objects have none)"
             return f'; nothing has the id {owner}: give the object that holds {rest} id="{owner}"{others}'
     if rest.partition(".")[0] in _PLACES:
         if not _poses(owner, known) and (why := _no_pose(owner, known)):
             return f"; {why}"
-        for near in (owner, *difflib.get_close_matches(owner, {name.partition(".")[0] for name in known}, n=1)):
+        for near in (owner, *difflib.get_close_matches(owner, owners, n=1)):
             if poses := _poses(near, known):
                 return f"; a pose is {poses} (--method smoothed)"
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
@@ -74,13 +76,19 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     return f"; it has {', '.join(shown[:6])}{' and others' if len(shown) > 6 else ''}" if shown else ""
 
 
+def _split(key: str) -> tuple[str, str]:
+    """Return the object's id and the rest of a key. An id may end in numbers, as Blender's Cube.001."""
+    owner = _OBJECT.match(key)
+    return (key, "") if owner is None else (owner[1], key[owner.end() :])
+
+
 def _same_quantity(key: str, names: list[str]) -> list[str]:
     """Return the names that contain a quantity of the key or an equivalent of it, of the key's own object if there are some."""
-    owner, *parts = key.split(".")
-    wanted = set(parts) - _SLOTS
+    owner, rest = _split(key)
+    wanted = set(rest.split(".")) - _SLOTS
     wanted = wanted.union(*(group for group in _EQUIVALENTS if group & wanted))
-    same = [name for name in names if wanted & set(name.split(".")[1:])]
-    return [name for name in same if name.partition(".")[0] == owner] or same
+    same = [name for name in names if wanted & set(_split(name)[1].split("."))]
+    return [name for name in same if _split(name)[0] == owner] or same
 
 
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
