@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 import unrender as ur
 from unrender.core.text import listed
+from unrender.runs import joint_maps
 from unrender.runs.joint_maps import hidden_changes, untested_changes
 
 SIZE, TEXELS = 16, 8
@@ -101,6 +103,45 @@ def test_a_run_that_is_too_short_for_the_test_says_so():
     assert [line.partition(":")[0] for line in hidden_changes(made, made.initial_values(), 16, 0.0)] == [
         f"whether changes of {COLOUR}, {NORMALS} hide one another"
     ]
+
+
+BOARD = [f"wall.bsdf.{name}.data" for name in ("base_color", "metallic", "roughness")]
+
+
+def board(metallic: float) -> ur.Problem:
+    """A wall of equal texels before three lamps, each in a picture of its own."""
+    values = {"base_color": [0.5, 0.5, 0.5], "metallic": [metallic], "roughness": [0.5]}
+    maps = {name: np.tile(np.array(x, np.float32), (TEXELS, TEXELS, 1)) for name, x in values.items()}
+    bsdf = {name: {"type": "bitmap", "bitmap": mi.Bitmap(x), "raw": True} for name, x in maps.items()}
+    names = [f"lamp{n}.intensity.value" for n in range(3)]
+    reference = np.full((SIZE, SIZE, 3), 0.3, np.float32)
+    views = [ur.View(reference, known={k: [9.0 * (k == name)] * 3 for k in names}) for name in names]
+    described = {**scene(*WHITE), "wall": {"type": "rectangle", "bsdf": {"type": "principled", **bsdf}}}
+    return ur.Problem(described, [ur.Parameter(key) for key in BOARD], views, max_depth=2)
+
+
+@pytest.mark.parametrize("metallic", [0.0, 0.1])
+def test_values_at_a_bound_change_inwards(metallic: float):
+    """The sign of an eigenvector is arbitrary: at a metallic map of 0 the change left the bounds, and roughness alone changed."""
+    made = board(metallic)
+    (line,) = hidden_changes(made, made.initial_values(), 16, math.inf)
+    assert line.startswith(f"{BOARD[1]}, {BOARD[2]}: changes of one hide those of another")
+
+
+def test_surfaces_share_the_time(monkeypatch: pytest.MonkeyPatch):
+    """Each of them had all of it, so that the end of a run with many took many times its limit."""
+    given: list[float] = []
+
+    def line(self: Any, seconds: float) -> list[str]:
+        given.append(seconds)
+        time.sleep(0.1)
+        return []
+
+    monkeypatch.setattr(joint_maps, "_surfaces", lambda problem: [["a", "b"]] * 6)
+    monkeypatch.setattr(joint_maps._Surface, "line", line)
+    hidden_changes(problem((COLOUR,), WHITE, False), {}, 16, 0.1)
+    assert given[0] == 0.1
+    assert given[-1] < 0.0
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ _EXPECTED, _NAMED = 0.5, 0.2
 """The same ratio by the derivatives, from which nothing is rendered; least part of a named texture, relative to the largest one."""
 _STEP, _TURN = 0.2, 0.02
 """Size of the changes relative to those of `changed`, a fiftieth of the range; turn of normals, in units of a normal map."""
+_SURFACES = 4
+"""Time limit of the tests of all surfaces, relative to that of one."""
 _STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
 """Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
 
@@ -52,13 +54,14 @@ def hidden_changes(
     Args:
         values: {key: array} at the end of a run.
         spp: samples per pixel of each rendering.
-        seconds: time limit of the test of a surface.
+        seconds: time limit of the test of a surface; all together have four times as long.
         per_pass: see `render`.
     """
-    lines = []
+    lines, until = [], time.perf_counter() + _SURFACES * seconds
     for keys in _surfaces(problem):
         try:
-            lines += _Surface(problem, values, keys, spp, per_pass).line(seconds)
+            left = min(seconds, until - time.perf_counter())
+            lines += _Surface(problem, values, keys, spp, per_pass).line(left)
         except InputError:  # the renderer rejects a value
             continue
     return lines
@@ -112,30 +115,24 @@ class _Surface:
         matrix = self._matrix(fields, seconds)
         if matrix is None:
             return [_untested(self.keys)]
-        height, width, count = matrix.shape[:3]
+        height, width = matrix.shape[:2]
         smooth = neighbour_means(matrix.reshape(height, width, -1), channels=True).reshape(matrix.shape)
         if not np.isfinite(smooth).all():
             return []
         amounts = _aligned(np.linalg.eigh(smooth)[1][..., 0])
         amounts /= np.abs(amounts).max(axis=-1, keepdims=True)
         diagonal = np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1).sum(axis=(0, 1)), 0.0)
-        squares, parts = np.square(amounts).mean(axis=(0, 1)), {}
-        after = {key: np.array(values[key], np.float64) for key in self.keys}
-        for key in self.keys:
-            own = [index for index in range(count) if fields[index][0] == key]
-            # Turns of normals have no channels of their own, so both have the mean size.
-            sizes = np.full(len(own), squares[own].mean()) if self._is_normal(key) else squares[own]
-            parts[key] = float(sizes @ diagonal[own])
-            after[key] += sum(_spread(amounts[..., n], np.shape(values[key]))[..., None] * fields[n][1] for n in own)
+        # Eigenvectors have no sign: one direction remains where values are at their bounds.
+        after, parts = max(
+            (self._within(fields, sign * amounts, diagonal) for sign in (1.0, -1.0)),
+            key=lambda of: sum(of[1].values()),
+        )
         total = sum(parts.values())
         joint = float(np.einsum("hwi,hwij,hwj->", amounts, matrix, amounts))
         named = [key for key, part in parts.items() if part > _NAMED**2 * max(parts.values())]
         if not total > 0.0 or joint > _EXPECTED**2 * total or not (len(named) > 1 or self._is_normal(named[0])):
             return []
-        moved = {
-            **values,
-            **{key: np.asarray(problem.unknowns[key].project(x), np.float32) for key, x in after.items()},
-        }
+        moved = {**values, **after}
         alone = total / (3.0 * sum(float(np.sum(problem.test_weights(view))) for view in range(len(problem.views))))
         rendered = time.perf_counter()
         change = change_of_images(problem, values, moved, _RENDERINGS * self.spp, self.per_pass)
@@ -156,6 +153,22 @@ class _Surface:
             f"{listed(named)}: changes of one hide those of another; together they change the pictures by {ratio} of what they do alone; "
             f"their values may be another solution: {advice}, or fix one of them"
         ]
+
+    def _within(
+        self, fields: Sequence[tuple[str, np.ndarray]], amounts: np.ndarray, diagonal: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+        """Return the values of each texture that changes within its bounds, and the sum of squares of the images' change by it alone."""
+        after, parts = {}, {}
+        for key in self.keys:
+            own = [n for n, (name, _) in enumerate(fields) if name == key]
+            before, squares, axes = np.asarray(self.values[key], np.float64), np.square(amounts[..., own]), (0, 1)
+            step = sum(_spread(amounts[..., n], before.shape)[..., None] * fields[n][1] for n in own)
+            after[key] = np.asarray(self.problem.unknowns[key].project(before + step), np.float32)
+            if self._is_normal(key):  # turns have no channels of their own, so both have the mean size
+                axes = (0, 1, 2)
+            left, whole = (np.square(x).sum(axis=axes) for x in (after[key] - before, step))
+            parts[key] = float(np.sum(squares.mean(axis=axes) * diagonal[own] * left / np.maximum(whole, 1e-300)))
+        return after, parts
 
     def _is_normal(self, key: str) -> bool:
         return self.problem.renderer.parameters()[key].role == "normal"
@@ -186,11 +199,14 @@ class _Surface:
             return None
         moved = [pictures({**values, name: np.asarray(values[name] + x, np.float32)}) for name, x in fields]
         changes = [
-            np.nan_to_num(np.stack([of[view] - before[view] for of in moved]) * mask_roots(problem, view) ** 2)
+            np.nan_to_num(
+                np.stack([of[view] - before[view] for of in moved]) * np.float32(mask_roots(problem, view) ** 2)
+            )
             for view in views
         ]
         session, keys = derivative_session(problem)
-        assert session is not None  # that of differentiable textures
+        if session is None:
+            raise InputError("the textures have no derivatives together with other unknowns")
         tree, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
         shape = tuple(min(np.shape(values[name])[axis] for name in self.keys) for axis in (0, 1))
         matrix = np.zeros((len(fields), *shape, len(fields)))
