@@ -129,7 +129,7 @@ def test_values_at_a_bound_change_inwards(metallic: float):
 
 
 def test_surfaces_share_the_time(monkeypatch: pytest.MonkeyPatch):
-    """Each of them had all of it, so that the end of a run with many took many times its limit."""
+    """Each of them had all of it, so that the end of a run with several took several times its limit."""
     given: list[float] = []
 
     def line(self: Any, seconds: float) -> list[str]:
@@ -140,8 +140,8 @@ def test_surfaces_share_the_time(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(joint_maps, "_surfaces", lambda problem: [["a", "b"]] * 6)
     monkeypatch.setattr(joint_maps._Surface, "line", line)
     hidden_changes(problem((COLOUR,), WHITE, False), {}, 16, 0.1)
-    assert given[0] == 0.1
-    assert given[-1] < 0.0
+    assert 0.0 < given[0] <= 0.1
+    assert max(given[1:]) < 0.0
 
 
 @pytest.mark.slow

@@ -36,10 +36,9 @@ _EXPECTED, _NAMED = 0.5, 0.2
 """The same ratio by the derivatives, from which nothing is rendered; least part of a named texture, relative to the largest one."""
 _STEP, _TURN = 0.2, 0.02
 """Size of the changes relative to those of `changed`, a fiftieth of the range; turn of normals, in units of a normal map."""
-_SURFACES = 4
-"""Time limit of the tests of all surfaces, relative to that of one."""
-_STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
-"""Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
+_STREAM, _LAUNCHES, _RENDERINGS, _ADJOINT = 9, 4, 4, 1.5
+"""Stream of the random numbers, adjoints of each change, samples of a rendering of the joint change relative to those of a part, and time
+of an adjoint relative to such a part's rendering."""
 
 
 def hidden_changes(
@@ -54,14 +53,13 @@ def hidden_changes(
     Args:
         values: {key: array} at the end of a run.
         spp: samples per pixel of each rendering.
-        seconds: time limit of the test of a surface; all together have four times as long.
+        seconds: time limit of the tests of all surfaces together.
         per_pass: see `render`.
     """
-    lines, until = [], time.perf_counter() + _SURFACES * seconds
+    lines, until = [], time.perf_counter() + seconds
     for keys in _surfaces(problem):
         try:
-            left = min(seconds, until - time.perf_counter())
-            lines += _Surface(problem, values, keys, spp, per_pass).line(left)
+            lines += _Surface(problem, values, keys, spp, per_pass).line(until - time.perf_counter())
         except InputError:  # the renderer rejects a value
             continue
     return lines
@@ -195,7 +193,7 @@ class _Surface:
             return [render(problem, of, view, self.spp, key.uint32(), self.per_pass) for view in views]
 
         before = pictures(values)
-        if ((1 + _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (time.perf_counter() - started) > seconds:
+        if ((1 + _ADJOINT * _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (time.perf_counter() - started) > seconds:
             return None
         moved = [pictures({**values, name: np.asarray(values[name] + x, np.float32)}) for name, x in fields]
         changes = [
