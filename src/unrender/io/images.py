@@ -69,7 +69,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
                 picture = _from_array(bounded_files.read_array(path), linearise, alpha, channels)
             else:
                 picture = _read(path, linearise, alpha)
-            _check_finite(picture.values)
+            refuse_pixels(~np.isfinite(picture.values), "NaN or infinite")
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         return replace(picture, notice=f"{path.name}: {picture.notice}" if picture.notice else "")
@@ -78,7 +78,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
     except (TypeError, ValueError) as error:
         raise InputError(f"expected a file or an array, got {type(source).__name__}") from error
     picture = _from_array(array, linearise, alpha, channels)
-    _check_finite(picture.values)
+    refuse_pixels(~np.isfinite(picture.values), "NaN or infinite")
     return picture
 
 
@@ -259,10 +259,10 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
     return Picture(values, alpha=opacity, premultiplied=opacity is not None)
 
 
-def _check_finite(values: np.ndarray) -> None:
-    bad = ~np.isfinite(values).all(axis=-1)
+def refuse_pixels(bad: np.ndarray, fault: str, advice: str = "") -> None:
+    """Raise `InputError` if channels of some pixels are bad, (H, W, C): their number, the fault, the first of them, and advice."""
     if bad.any():
-        (row, column), count = np.argwhere(bad)[0], int(bad.sum())
-        raise InputError(
-            f"{count} {'pixels are' if count > 1 else 'pixel is'} NaN or infinite, the first in row {row}, column {column}"
-        )
+        pixels = np.argwhere(bad.any(axis=-1))
+        (row, column), count = pixels[0], len(pixels)
+        which = f"{count} {'pixels are' if count > 1 else 'pixel is'}"
+        raise InputError(f"{which} {fault}, the first in row {row}, column {column}{advice}")

@@ -160,13 +160,9 @@ def _is_of_film(source: Any) -> bool:
 
 
 def _check_not_negative(values: np.ndarray) -> None:
-    bad = (values < _DARKEST * max(float(values.max()), 0.0)).any(axis=-1)
-    if bad.any():
-        (row, column), count = np.argwhere(bad)[0], int(bad.sum())
-        raise InputError(
-            f"{count} {'pixels are' if count > 1 else 'pixel is'} negative, the first in row {row}, column {column}, but radiance is not; "
-            "clip them at 0, or use the same reconstruction filter with negative lobes in the film"
-        )
+    bad = values < _DARKEST * max(float(values.max()), 0.0)
+    advice = "clip them at 0, or use the same reconstruction filter with negative lobes in the film"
+    images.refuse_pixels(bad, "negative", f", but radiance is not; {advice}")
 
 
 _WHITE = 0.001

@@ -84,7 +84,8 @@ def _turned(renderer: Renderer, views: Sequence[View], keys: Sequence[str]) -> t
     found = turns_of(own, count, [(view.sensor, view.known or {}) for view in views], used) if alike else None
     if found and len(found[0].sensors) > count:  # a copy of a sensor does not follow unknowns of its camera
         known = {**own.parameters(), **renderer.parameters()}
-        found = None if any(key in known and known[key].viewpoint for key in used) else found
+        if any(key in known and known[key].viewpoint for key in used):
+            found = None
     turned = own.with_turns(None if found is None else found[0], used)
     return renderer if turned is own else with_scene(renderer, turned), [] if found is None else found[1]
 

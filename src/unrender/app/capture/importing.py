@@ -51,6 +51,7 @@ STILL_LIGHT = (
     "curve; only highlights and vignetting determine the response"
 )
 LIT_DEFAULT = ("colour", "normal")
+_NO_SHAPE = "neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N for a radiance field"
 _OF_ASSET = ("masks", "voxels", "faces", "texture", "band", "turntable")
 _OF_POSES = ("mesh", "axes", "world_to_camera", "voxels", "faces", "texture", "band", "turntable", "field")
 _OF_CHECK = {CHECK, SHEET}
@@ -322,15 +323,11 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     if unwrapped and (own_mesh is None or own_mesh.uv is None):
         meshes.check_atlas_installed()
     if own_mesh is None and not _has_masks(capture):
-        raise InputError(
-            f"{folder}: neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N for a radiance field"
-        )
+        raise InputError(f"{folder}: {_NO_SHAPE}")
     views, notices = _views(capture, options)
     masked = all(views.masked)
     if own_mesh is None and not masked:
-        raise InputError(
-            f"{folder}: neither masks nor a mesh: give --masks DIR or --mesh FILE, or --field N for a radiance field"
-        )
+        raise InputError(f"{folder}: {_NO_SHAPE}")
     training = views.of(held_out=False)
     with phases.phase("shape"):
         try:
