@@ -9,7 +9,7 @@ from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.optimizers import ScheduleFree
 from unrender.optimizers.transforms.fitted_sobolev import FittedSobolevState
-from unrender.optimizers.transforms.wiener_shrinkage import signal_share
+from unrender.optimizers.transforms.shrinkage import signal_share
 from unrender.preconditioners import Sobolev, grid
 from unrender.preconditioners.grid import GridPyramid
 

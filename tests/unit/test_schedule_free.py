@@ -17,12 +17,11 @@ from unrender.estimators.capabilities import AtBounds, FreshGradient
 from unrender.optimizers import Adam, ScheduleFree
 from unrender.optimizers.transforms import agreement_rate, fitted_sobolev, lasting_agreement
 from unrender.optimizers.transforms.agreement_rate import Agreement
+from unrender.optimizers.transforms.averages import Iterates
 from unrender.optimizers.transforms.base import StepUpdate
 from unrender.optimizers.transforms.fitted_sobolev import FittedSobolevState, StrengthFit
-from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import MeanSquare
-from unrender.optimizers.transforms.schedule_free_average import Iterates
-from unrender.optimizers.transforms.wiener_shrinkage import GradientProducts
+from unrender.optimizers.transforms.shrinkage import GradientProducts, PullToStart
 from unrender.preconditioners import Sobolev
 from unrender.runs.folder.state import check_alike
 from unrender.schedules import Cosine

@@ -21,7 +21,7 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
-from unrender.statistics.overlap import overlap
+from unrender.statistics.debiased import overlap
 
 SIZE, TEXELS = 12, 6
 NOISE = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unrender.core.welding import weld
+from unrender.core.geometry import weld
 
 
 def tube(radius: float = 1.0, shift: float = 0.0) -> np.ndarray:

@@ -111,7 +111,8 @@ def use(variant: str = "auto") -> str:
     if not is_on_gpu(chosen):
         _check_llvm()
     elif not is_on_gpu(mi.variant()) and (problem := gpu_problem()):
-        raise VariantError(f"{chosen} cannot run here: {problem}; {on_cpu(chosen)!r} runs on the CPU")
+        on_cpu = chosen.replace("cuda", "llvm", 1)
+        raise VariantError(f"{chosen} cannot run here: {problem}; {on_cpu!r} runs on the CPU")
     with _setting:
         if mi.variant() != chosen:
             try:
@@ -144,11 +145,6 @@ def is_gpu() -> bool:
 def lookup_mask(active: Any) -> Any:
     """Return the mask of a texture lookup outside a virtual call. On a GPU there is none, so the caller discards inactive lanes."""
     return True if is_gpu() else active
-
-
-def on_cpu(variant: str) -> str:
-    """Return the variant for the CPU that renders the same colours."""
-    return variant.replace("cuda", "llvm", 1)
 
 
 def same_colours(variant: str, other: str) -> bool:
@@ -331,7 +327,6 @@ def _mitsuba() -> Any:
 
 
 def _check_llvm() -> None:
-    """Raise `VariantError` unless Dr.Jit has loaded a supported LLVM."""
     version = llvm_version()
     if version is not None and llvm.is_usable(version[0]):
         return
@@ -345,7 +340,6 @@ def _check_llvm() -> None:
 
 
 def _describe_llvm(version: tuple[int, ...] | None, library: str | None) -> str:
-    """Describe the unusable LLVM: loaded as `version`, or configured by the path `library`."""
     if library:
         path = Path(library)
         major = version[0] if version else llvm.identify(path).major

@@ -193,7 +193,8 @@ def _add(made_by: Any, name: str | None, kind: str | None, states: str | None, p
         )
     if not chosen.members and chosen.protocol not in _bases(made_by):
         raise InputError(f"register: {where}: a {chosen.name} inherits from {chosen.protocol}")
-    called = name or (made_by.__name__ if chosen.in_tables else _hyphenated(made_by.__name__))
+    hyphenated = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", made_by.__name__).lower()
+    called = name or (made_by.__name__ if chosen.in_tables else hyphenated)
     space = "table" if chosen.in_tables else chosen.name
     with _lock:
         known = _components.get((space, called))
@@ -253,10 +254,6 @@ def _detect(made_by: type, where: str) -> Kind:
 
 def _bases(made_by: type) -> frozenset[str]:
     return frozenset(f"{base.__module__}.{base.__qualname__}" for base in made_by.__mro__)
-
-
-def _hyphenated(name: str) -> str:
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).lower()
 
 
 def _load(kind: str) -> None:

@@ -54,17 +54,13 @@ def parse(text: str, kind: str) -> Any:
     arguments: dict[str, Any] = {field.name: _number(part, kind) for field, part in zip(numbers, texts, strict=False)}
     if rest:
         if len(numbers) == len(every):
-            raise InputError(f'{kind}: only {_with_next(known)} can have something after "then", got {text!r}')
+            names = (name for name, of in known.items() if any(each.name == _NEXT for each in dataclasses.fields(of)))
+            raise InputError(f'{kind}: only {", ".join(names)} can have something after "then", got {text!r}')
         arguments[_NEXT] = parse(rest[0], kind)
     try:
         return known[name](**arguments)
     except InputError as error:
         raise InputError(f"{kind}: {error}") from error
-
-
-def _with_next(known: dict[str, type]) -> str:
-    names = [name for name, made_by in known.items() if any(each.name == _NEXT for each in dataclasses.fields(made_by))]
-    return ", ".join(names)
 
 
 def _number(text: str, kind: str) -> int | float:

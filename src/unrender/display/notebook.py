@@ -126,17 +126,14 @@ class NotebookBar(phases.Listener):
         self._updated = -1.0
 
     def on_phase(self, name: str) -> None:
-        """Display the name of a phase that starts."""
         self._within.append(name)
         self.show(name, None, at_once=True)
 
     def on_progress(self, share: float) -> None:
-        """Display the progress of the innermost phase."""
         if self._within:
             self.show(self._within[-1], share)
 
     def on_phase_end(self, name: str) -> None:
-        """Return to the enclosing phase."""
         del name
         self._within.pop()
 

@@ -118,7 +118,8 @@ def _second_order(
         case Variance(values):
             return Variance({k: v * slopes[k] * slopes[k] if k in slopes else v for k, v in values.items()})
         case Hessian(matrix):
-            J, term = _flat(slopes, parameters), _curvature_term(gradient, problem, parameters)
+            curved = {key: gradient[key] * x for key, x in problem.coordinates.curvatures(parameters).items()}
+            J, term = _flat(slopes, parameters), _flat(curved, parameters, missing=0.0)
             full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(term)
             return Hessian(full)
         case GradientNoise(matrix) | HessianNoise(matrix) | ScoreCovariance(matrix):
@@ -173,12 +174,6 @@ def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:
     )
 
 
-def _curvature_term(gradient: Tree, problem: Problem, parameters: Tree) -> np.ndarray:
-    """Return g φ'', (n,)."""
-    curvatures = problem.coordinates.curvatures(parameters)
-    return _flat({key: gradient[key] * x for key, x in curvatures.items()}, parameters, missing=0.0)
-
-
 _ALONE = 0.1
 """Size of the perturbations of elements that stay at a bound, relative to those that are smoothed: enough for the sign of a gradient."""
 _PROBES = 4
@@ -186,8 +181,7 @@ _PROBES = 4
 
 
 class PreconditionedPerturbations:
-    """A function of the parameters as a function of v, where u = θ + S (v − θ), with the preconditioners S and the current parameters
-    θ.
+    """A function of the parameters as a function of v, where u = θ + S (v − θ), with the preconditioners S and the current parameters θ.
 
     A Gaussian of v with standard deviation σ moves u by σ S ε: neighbours move alike, by less than σ. `deviations` are those of v that
     move the elements of u by σ, in the root mean square over a parameter. Without preconditioners nothing changes.

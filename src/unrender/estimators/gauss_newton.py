@@ -109,8 +109,7 @@ class GaussNewton:
     exceeds the residual (see `PathGradient`, `tolerance`), and the secant ℓ'(r) / r replaces ℓ''.
 
     Use it for few parameters, such as poses of sensors: each element takes two renders of every view that it changes. It needs no
-    derivative of the renderer, so every parameter that can be rendered is supported. A sensor's own parameters only change its own
-    views.
+    derivative of the renderer, so every parameter that can be rendered is supported. A sensor's own parameters only change its own views.
 
     Args:
         spp: samples per pixel of the image, >= 2.

@@ -292,7 +292,6 @@ class HybridGradient:
     def _problems(
         self, problem: Problem, parameters: Tree, own: Sequence[str], response: Response | None
     ) -> tuple[Problem, Problem]:
-        """Return the problem of each of the two estimators."""
         held = {key: x for key, x in parameters.items() if key not in own}
         renderer = HeldParameters(problem.renderer, held)
         if response is not None:

@@ -87,13 +87,12 @@ def _distance(a: Tree, b: Tree) -> float:
 class MetaEstimator:
     """M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i: Eq. 7 of Balint et al. 2023, per element of each parameter.
 
-    The independent form is the paper's. F uses `proportional_spp` samples per pixel, ΔF `difference_spp` other samples. For ΔF, one set
-    of paths, traced in the current scene, gives the images and the adjoints of both states. The loss derivative of each state comes
-    from a pair of images independent of those paths: the other sample groups or, for one sample per pixel, a separate pair.
-    `difference_images="proportional"` takes that pair from F's samples, whose paths are then traced for both states: the loss
-    derivatives of ΔF use the mean of `proportional_spp` samples, and ΔF traces its own paths once. F's samples are independent of ΔF's
-    paths, so ΔF is unbiased. But F and ΔF then share the noise of an image, and the variance by Eq. 8, which assumes independence,
-    lacks their covariance.
+    The independent form is the paper's. F uses `proportional_spp` samples per pixel, ΔF `difference_spp` other samples. For ΔF, one set of
+    paths, traced in the current scene, gives the images and the adjoints of both states. The loss derivative of each state comes from a
+    pair of images independent of those paths: the other sample groups or, for one sample per pixel, a separate pair.
+    `difference_images="proportional"` takes that pair from F's samples, whose paths are then traced for both states: the loss derivatives
+    of ΔF use the mean of `proportional_spp` samples, and ΔF traces its own paths once. F's samples are independent of ΔF's paths, so ΔF is
+    unbiased. But F and ΔF then share the noise of an image, and the variance by Eq. 8, which assumes independence, lacks their covariance.
 
     The coupled form, an extension of the paper, computes F and the previous state's H from the same `spp` samples. M = F + w (M − H) with
     w from their covariance. Each sample serves both terms, at little more than the cost of a plain gradient. With

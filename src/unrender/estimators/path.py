@@ -18,7 +18,6 @@ from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradie
 from unrender.estimators.emitter_selection import EmitterSelection, EmitterState
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, check_pixels, draws_pixels, leave_one_out_groups
 from unrender.images.base import ImageEstimator, Plain, needs_full_views
-from unrender.losses.pixelwise import Loss
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.base import MiniBatch, PixelSampler, learned
 from unrender.pixels.uniform import All
@@ -124,9 +123,6 @@ class PathGradient:
         """Number of leave-one-out sample groups; 1 if the adjoint has separate paths."""
         return leave_one_out_groups(self.spp, self.adjoint_spp)
 
-    def _has_secant(self, loss: Loss) -> bool:
-        return loss.linear or (loss.pixelwise and self.tolerance > 0)
-
     def _in_window(self, step: int) -> bool:
         """Return whether the estimate of this index has the fresh gradient as well."""
         if self.fresh_from == 0 or step < self.fresh_from:
@@ -162,6 +158,7 @@ class PathGradient:
         emitters, emitter_request = state.emitters, None
         if emitters is not None:
             emitter_request = emitter_selection.request(problem, parameters, emitters, key.fold(_EMITTERS))
+        secant = problem.loss.linear or (problem.loss.pixelwise and self.tolerance > 0)
         request = GradientRequest(
             parameters,
             self.image,
@@ -171,7 +168,7 @@ class PathGradient:
             self.adjoint_spp,
             batch=batch,
             tolerance=self.tolerance,
-            fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
+            fresh=batch.sample is None and self._in_window(state.step) and secant,
             noise=batch.sample is None and self.noise_sample and state.step == 0,
             emitters=emitter_request,
         )

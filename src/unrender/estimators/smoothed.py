@@ -79,10 +79,9 @@ class SmoothedDerivatives:
     supported. All perturbations of a step share the random numbers of their renders, so differences are due to the parameters, not to
     noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
-    A parameter with a preconditioner S is perturbed by S ε instead of ε, scaled to σ in the root mean square, so neighbouring vertices
-    or texels move together. Derivatives are then with respect to v, where the parameter is S v; the smoothing Gaussian has covariance S².
-    Use it for meshes and textures of thousands of elements: the noise of a gradient grows with the number of directions, which S
-    reduces.
+    A parameter with a preconditioner S is perturbed by S ε instead of ε, scaled to σ in the root mean square, so neighbouring vertices or
+    texels move together. Derivatives are then with respect to v, where the parameter is S v; the smoothing Gaussian has covariance S². Use
+    it for meshes and textures of thousands of elements: the noise of a gradient grows with the number of directions, which S reduces.
 
     Unbiased for the derivative of the smoothed expected loss of images at `spp` samples. Their noise adds to the loss unless it is
     `debiased`. Products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
@@ -112,13 +111,12 @@ class SmoothedDerivatives:
             and 0 on a slope or a plateau of any length. σ therefore decreases after convergence at the current σ. Half-lives are
             shorter, e.g. `Exponential(6)`. Use it for few parameters: with many, the curvature in all other directions dominates the
             slope in one, and the schedule advances at every step.
-        hessian_rate: ω in (0, 1], for "hvp": products use a Hessian that is stored between steps in units of σ, (n, n), so all
-            products of a step are free. None, the default: products use this step's renders only. With `joint`, the stored matrix B
-            moves by ω towards this step's Hessian. Otherwise each step estimates one product h along a random direction v, by the
-            difference of two gradients whose mean is the step's gradient, with `samples` renders for both in one launch, and moves B by
-            ω towards the nearest symmetric matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random
-            directions). The first B is vᵀh times the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature
-            biases products, not the gradient.
+        hessian_rate: ω in (0, 1], for "hvp": products use a Hessian that is stored between steps in units of σ, (n, n), so all products of
+            a step are free. None, the default: products use this step's renders only. With `joint`, the stored matrix B moves by ω towards
+            this step's Hessian. Otherwise each step estimates one product h along a random direction v, by the difference of two gradients
+            whose mean is the step's gradient, with `samples` renders for both in one launch, and moves B by ω towards the nearest symmetric
+            matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random directions). The first B is vᵀh times
+            the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature biases products, not the gradient.
         hessian_form: "full", or "diagonal": with `hessian_rate`, only the diagonal is stored, (n,), for many weakly coupled parameters.
             Each sample determines one sum of its elements: zᵀ B z if joint, zᵀ B v otherwise. A step moves the diagonal by ω towards
             the nearest one that satisfies all sums; the first is a multiple of the identity (`statistics/hessian_updates.py`).

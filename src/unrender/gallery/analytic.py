@@ -87,7 +87,6 @@ class _OnePixel:
         return [(1, 1)]
 
     def array(self, values: np.ndarray) -> np.ndarray:
-        """Return a NumPy array in double precision."""
         return np.array(values, np.float64)
 
     def prepare(

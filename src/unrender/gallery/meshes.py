@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.rotations import rotation
+from unrender.core.geometry import rotation
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.description import load, load_described
 from unrender.scene.meshes import subdivided

@@ -16,8 +16,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.geometry import rotation
 from unrender.core.registry import register
-from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts
 from unrender.scene.parameter import Parameter
 

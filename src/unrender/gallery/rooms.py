@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.geometry import rotation
 from unrender.core.registry import register
-from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts
 from unrender.losses import L1, Loss, RelativeL2
 from unrender.preconditioners import LargeSteps

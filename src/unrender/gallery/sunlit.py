@@ -18,8 +18,8 @@ import numpy as np
 
 from unrender.backend import variant
 from unrender.core import checks
+from unrender.core.geometry import MITSUBA_TO_OPENGL
 from unrender.core.registry import register
-from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.gallery import fields, meshes, parts
 from unrender.io import files
 from unrender.losses import L1, Loss

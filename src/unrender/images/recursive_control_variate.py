@@ -249,8 +249,7 @@ class RecursiveControlVariate:
         later step, that step is rendered with the same random numbers, too. Its image is P + w (⟨F_s⟩_CV − H) for the rendering P.
 
         Raises:
-            InputError: the requested pair belongs to another step than the control variate, or a mini-batch precedes the first full
-                views.
+            InputError: the requested pair belongs to another step than the control variate, or a mini-batch precedes the first full views.
         """
         first = self._is_first(parameters, state)
         if pair_request is not None and pair_request.step != state.step:

@@ -23,11 +23,6 @@ VARIABLE = "UNRENDER_ALLOW_OUTSIDE"
 _folders: ContextVar[tuple[Path, ...]] = ContextVar("folders", default=())
 
 
-def is_outside_allowed() -> bool:
-    """Return whether files may be outside of the folder of the input that refers to them."""
-    return os.environ.get(VARIABLE, "0") not in ("", "0")
-
-
 def allow(everything: bool) -> bool:
     """Allow outside files for this process and its children if `everything` is true. Returns `everything`."""
     if everything:
@@ -55,7 +50,7 @@ def check(path: Path, folders: Sequence[Path], what: str) -> None:
 
     Its message begins with `what`, the input and how it refers to the file, and names the first folder.
     """
-    if is_outside_allowed():
+    if os.environ.get(VARIABLE, "0") not in ("", "0"):
         return
     try:
         real = path.resolve()

@@ -92,18 +92,10 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
         if width < 1 or height < 1 or values > MOST_VALUES or max(width, height) > LONGEST_SIDE:
             limits = f"at most {MOST_VALUES} values in all and {LONGEST_SIDE} pixels a side"
             raise InputError(f"declares {what}, expected at least one and {limits}")
-        if values > _plausible(size):
+        # Constant images compress a thousandfold, and could fill the memory; photographs have up to 30 values per byte, masks 500.
+        if values > max(1 << 25, min(512 * size, 1 << 26), 32 * size):
             raise InputError(f"declares {what} in {size} bytes; if that is right, save it without compression")
     return header
-
-
-def _plausible(size: int) -> int:
-    """Return the largest plausible number of values of a file of `size` bytes.
-
-    Constant images compress by a factor of a thousand, so a small file could fill the memory. A photograph has at most about 30 values
-    per byte, a mask 500.
-    """
-    return max(1 << 25, min(512 * size, 1 << 26), 32 * size)
 
 
 Sizes = list[tuple[int, int, int]]

@@ -206,7 +206,6 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
 
 
 def _coverage(stored: np.ndarray) -> np.ndarray:
-    """Return integer alpha as a fraction in [0, 1]."""
     return (stored / np.float32(np.iinfo(stored.dtype).max)).astype(np.float32)
 
 

@@ -302,7 +302,6 @@ class _Unpacked:
         return b"".join(parts)
 
     def floats(self, count: int, kind: str) -> bool:
-        """Read `count` numbers. Returns whether all are finite."""
         finite = True
         for start in range(0, count, _BLOCK):
             size = min(_BLOCK, count - start)

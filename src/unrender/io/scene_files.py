@@ -208,7 +208,6 @@ class _Reader:
             raise InputError(f"scene {shown}:{error.lineno}: not XML: {expat.ErrorString(error.code)}") from error
 
     def count(self, shown: str) -> None:
-        """Count an element. Raises `InputError` above the limit."""
         self._elements += 1
         if self._elements > _MOST_ELEMENTS:
             raise InputError(f"scene {shown}: more than {_MOST_ELEMENTS} elements")

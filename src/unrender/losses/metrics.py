@@ -153,7 +153,6 @@ def _pair(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = No
 
 
 def _mean(values: np.ndarray, mask: np.ndarray | None) -> float:
-    """Return the mean of (H, W, ...) values, with the weights of a mask (H, W)."""
     if mask is None:
         return float(np.mean(values))
     return float(np.average(values.reshape(*mask.shape, -1).mean(axis=2), weights=mask))

@@ -14,14 +14,12 @@ from unrender.core.trees import Tree
 from unrender.optimizers import rates
 from unrender.optimizers.chain import ChainState, Recipe
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
+from unrender.optimizers.transforms.averages import DecayingSum, GradientMean, ScheduleFreeAverage
 from unrender.optimizers.transforms.base import StepTransform, checked_keys
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
 from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
-from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
-from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import ScaleByDeviation, ScaleByRms
-from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
-from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
+from unrender.optimizers.transforms.shrinkage import PullToStart, WienerShrinkage
 from unrender.preconditioners.base import Preconditioner
 from unrender.schedules import Schedule
 

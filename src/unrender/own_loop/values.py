@@ -34,7 +34,6 @@ class _Render(dr.CustomOp):
         return several if len(images) > 1 else several[0]
 
     def backward(self) -> None:
-        """Propagate the images' derivatives to the parameters, see `dr.CustomOp`."""
         gradient: Any = self.grad_out()
         derivatives: Any = gradient if isinstance(gradient, tuple) else (gradient,)
         kind: Any = type(derivatives[0])
@@ -46,7 +45,6 @@ class _Render(dr.CustomOp):
         self.set_grad_in("values", self._backward(expanded))
 
     def forward(self) -> None:
-        """Raise `RuntimeError`: forward mode is not supported."""
         raise RuntimeError("Renderer: forward-mode derivatives are not supported; use dr.backward")
 
     def name(self) -> str:
@@ -83,7 +81,6 @@ def _torch_operation() -> Any:
 
         @staticmethod
         def forward(ctx: Any, backward: Any, images: tuple[Any, ...], *values: Any) -> Any:
-            """Return the images, see `torch.autograd.Function`."""
             del values
             ctx.backward_pass, ctx.shapes = backward, [(image.shape, image.dtype) for image in images]
             return images
@@ -91,7 +88,6 @@ def _torch_operation() -> Any:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *derivatives: Any) -> tuple[Any, ...]:
-            """Return the gradient of each input, see `torch.autograd.Function`."""
             complete = tuple(
                 torch.zeros(shape, dtype=kind) if one is None else one
                 for one, (shape, kind) in zip(derivatives, ctx.shapes, strict=True)

@@ -130,7 +130,6 @@ class _GradientVariance(ImportanceRule):
     """Importance of Eq. 12, averaged over levels by Eq. 18."""
 
     def maps(self, statistics: PixelStatistics) -> Maps:
-        """Return the second moment of the parameter derivatives, then that of the loss derivative per level."""
         return (statistics.second_moment, *statistics.squares)
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
@@ -181,10 +180,8 @@ class _LossDerivative(ImportanceRule):
     """Importance of Eq. 5."""
 
     def maps(self, statistics: PixelStatistics) -> Maps:
-        """Return the mean magnitude of the loss derivative."""
         return (statistics.magnitudes[0],)
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
-        """Return the sum over the channels."""
         del tiles, maps
         return denoised[0].sum(axis=1)

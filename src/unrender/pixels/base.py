@@ -27,8 +27,7 @@ class MiniBatch:
         samples: number of paths traced to estimate their probabilities.
         probability: {view: pixels' probability or sample count relative to uniform sampling}, a map of the tiles (rows, columns); {} if
             uniform.
-        tangents: parameter tangents along which the squared derivatives of the pixels are requested (`DrawStatistics`); {} for no
-            request.
+        tangents: parameter tangents along which the squared derivatives of the pixels are requested (`DrawStatistics`); {} for no request.
         shares: distribution of the samples over full views; None for equal numbers.
     """
 

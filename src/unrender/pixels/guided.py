@@ -94,8 +94,7 @@ class ImportanceRule(ABC):
         levels: number of coarser resolutions at which the loss derivative is estimated, >= 0.
         learns: whether the samples of the steps update the maps.
         by_cost: whether a pixel's importance is divided by the root of its cost.
-        needs_second_moment: whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of
-            paths.
+        needs_second_moment: whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of paths.
     """
 
     levels: int = 0

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.welding import weld
+from unrender.core.geometry import weld
 
 if TYPE_CHECKING:
     import scipy.sparse

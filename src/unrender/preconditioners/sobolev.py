@@ -140,8 +140,7 @@ class Sobolev:
         return np.array([[np.vdot(gain, part) for gain in gains] for part in sums])
 
     def summary(self, gradient: Array) -> np.ndarray | None:
-        """Return the part of a gradient that `descents_of_summaries` needs, (m,) float32; None for meshes and small grids
-        (`descents`)."""
+        """Return the part of a gradient that `descents_of_summaries` needs, (m,) float32; None for meshes and small grids (`descents`)."""
         pyramid = self._pyramid(arrays.shape(gradient))
         return None if pyramid is None else pyramid.summary(gradient)
 

@@ -37,14 +37,12 @@ _FEWEST = 3
 class Corrections:
     """Map between the parameter `poses` (V, 6) and the pose parameters of V cameras.
 
-    Row v is (ω, t). The rotation vector ω turns the camera about its own position, in degrees along the world axes. The
-    vector t translates it. The unit of t is the length of an arc of one degree at the distance R. R is the root mean
-    square distance of the cameras from their centroid m. A unit of any of the six numbers therefore changes a picture
-    by a similar amount.
+    Row v is (ω, t). The rotation vector ω turns the camera about its own position, in degrees along the world axes. The vector t translates
+    it. The unit of t is the length of an arc of one degree at the distance R. R is the root mean square distance of the cameras from their
+    centroid m. A unit of any of the six numbers therefore changes a picture by a similar amount.
 
-    A similarity transform of all cameras, to first order ω the same for all and t = ω × (c_v - m) + τ + s (c_v - m), is
-    equivalent to a transform of the asset and its lights. This part of the rows is projected out: P = 1 - G (Gᵀ G)⁻¹
-    Gᵀ.
+    A similarity transform of all cameras, to first order ω the same for all and t = ω × (c_v - m) + τ + s (c_v - m), is equivalent to a
+    transform of the asset and its lights. This part of the rows is projected out: P = 1 - G (Gᵀ G)⁻¹ Gᵀ.
 
     Args:
         cameras: {sensor: its camera}, at least 3.
@@ -85,9 +83,8 @@ class Corrections:
         return (flat - (flat @ self._common) @ self._common.T).reshape(rows.shape)
 
     def poses(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return {key: (..., 3)} of the cameras' pose parameters for rows (..., V, 6): rotations in radians,
-        translations in world units.
-        """
+        """Return {key: (..., 3)} of the cameras' pose parameters for rows (..., V, 6): rotations in radians, translations in world
+        units."""
         moved = self.projected(rows)
         poses = {}
         for row, camera in enumerate(self.cameras.values()):
@@ -180,9 +177,7 @@ class PosedCamerasSession(SessionWrapper):
         return {**{key: value for key, value in tangents.items() if key != POSES}, **still}
 
     def _state(self, parameters: Tree) -> Tree:
-        """Return the parameters of the inner session. Equal poses give identical arrays, so the scene need not set them
-        again.
-        """
+        """Return the parameters of the inner session. Equal poses give identical arrays, so the scene need not set them again."""
         rows = parameters[POSES]
         known = next((tree for poses, tree in self._trees if poses is rows), None)
         if known is None:

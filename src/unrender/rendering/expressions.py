@@ -115,7 +115,6 @@ class ExpressionRenderer(RendererWrapper):
         return list(dict.fromkeys(member for key in keys for member in self._targets.get(key, [key])))
 
     def around(self, inner: Renderer) -> ExpressionRenderer:
-        """Return the same functions around another renderer."""
         return ExpressionRenderer(inner, self.expressions, self.unknowns)
 
     def evaluated(self, values: Mapping[str, Any]) -> Tree:
@@ -269,7 +268,6 @@ class _ExpressionSession(SessionWrapper):
         return {**rest, **values}
 
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
-        """Return the tangents of the scene's parameters: the functions' derivatives along those of the unknowns."""
         own, _ = self._split(parameters)
         moved, rest = self._split(tangents)
         leaves = _leaves(own)
@@ -282,7 +280,6 @@ class _ExpressionSession(SessionWrapper):
         return {**rest, **along}
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
-        """Return the gradient by the unknowns: the functions' derivatives, transposed, times that by the scene's parameters."""
         own, rest = self._split(parameters)
         gradient = {key: inner_gradient[key] for key in rest if key in inner_gradient}
         leaves = _leaves({key: x for key, x in own.items() if key in self._differentiable})

@@ -170,7 +170,6 @@ class TiedRenderer(RendererWrapper):
         return super().with_meshes(meshes, self.expanded(keys))
 
     def around(self, inner: Renderer) -> TiedRenderer:
-        """Return the same ties around another renderer."""
         return TiedRenderer(inner, self.ties)
 
     def expanded(self, keys: Iterable[str]) -> list[str]:

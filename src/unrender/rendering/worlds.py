@@ -110,7 +110,6 @@ class WorldsRenderer(RendererWrapper):
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """See `RendererWrapper.notices`: those of all scenes, each once."""
         return tuple(dict.fromkeys(line for one in self.renderers for line in getattr(one, "notices", ())))
 
     def state_of(self, sensor: int) -> World:
@@ -187,7 +186,6 @@ class WorldsRenderer(RendererWrapper):
         return self._changed(lambda one: changed[id(one)])
 
     def around(self, inner: Renderer) -> Renderer:
-        """Return a renderer of the same worlds with another renderer of the first scene."""
         return self._changed(lambda one: inner if one is self.inner else one)
 
     def _changed(self, change: Callable[[Renderer], Renderer]) -> WorldsRenderer:

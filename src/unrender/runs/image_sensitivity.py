@@ -19,7 +19,7 @@ from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, selected_views, view_request
-from unrender.statistics.overlap import overlap
+from unrender.statistics.debiased import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 MAP_AXES = 3

@@ -324,7 +324,6 @@ class _Mean:
 
     @property
     def is_known(self) -> bool:
-        """Return whether the estimate is significantly positive."""
         return self.value > _ERRORS * self.error
 
 

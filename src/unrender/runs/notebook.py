@@ -99,8 +99,10 @@ def html(result: Result) -> str:
     seconds, loss = loss_curve(result.history)
     errors = error_curves(result.history, start_errors(result))
     lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
+    measure_of = measures(result)
+    title = parameter_errors.title(measure_of[key] for key in result.truth if key in measure_of)
     charts = [
-        chart(error_title(result), lines, "seconds", end),
+        chart(title, lines, "seconds", end),
         chart("Loss, of the steps' samples", [Line("loss", seconds, loss)], "seconds", end) if len(loss) else None,
     ]
     rows = _numbers(result) | {"image error": _image_error(result), "time": formatting.phases(result.phases)}
@@ -148,12 +150,6 @@ def start_errors(result: Result) -> dict[str, float]:
         if key in result.initial
     }
     return {key: error for key, error in errors.items() if error is not None}
-
-
-def error_title(result: Result) -> str:
-    """Return the title of a chart of the result's errors."""
-    measure_of = measures(result)
-    return parameter_errors.title(measure_of[key] for key in result.truth if key in measure_of)
 
 
 def _summary(result: Result) -> str:

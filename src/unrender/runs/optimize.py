@@ -104,7 +104,6 @@ def optimize(
 
 
 def _check_kinds(problem: Any, callbacks: Any) -> None:
-    """Raise `InputError` for a problem or callbacks of another kind."""
     if not isinstance(problem, Problem):
         raise InputError(f"optimize: expected a Problem, such as that of Problem.from_file, got {_shown(problem)}")
     if not isinstance(callbacks, Sequence) or not all(isinstance(each, Callback) for each in callbacks):
@@ -189,9 +188,8 @@ def estimate(
     Args:
         problem: problem to solve.
         estimator: gradient estimator, or the name of a method.
-        parameters: {key: array} of all parameters of the problem; None for the initial ones. Values at a bound of their
-            range are moved inside by 1e-4 of the range: no path has a gradient with respect to a black reflectance, or to a lobe of
-            probability 0.
+        parameters: {key: array} of all parameters of the problem; None for the initial ones. Values at a bound of their range are moved
+            inside by 1e-4 of the range: no path has a gradient with respect to a black reflectance, or to a lobe of probability 0.
         seed: seed of the random numbers.
     """
     estimator = resolve_estimator(problem, estimator, "estimate")
@@ -227,8 +225,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
         optimizer: an optimizer; None for the method's.
 
     Raises:
-        InputError: an argument is missing or of another kind, such as an optimizer of Mitsuba or PyTorch, or a class instead of an
-            object.
+        InputError: an argument is missing or of another kind, such as an optimizer of Mitsuba or PyTorch, or a class instead of an object.
     """
     if optimizer is None and isinstance(estimator, Plan):
         return replace(estimator, problem=problem)

@@ -73,7 +73,6 @@ class Progress(Callback):
     # ------------------------------------------------------------------ phases
 
     def on_phase(self, name: str) -> None:
-        """Display the name of a phase that starts."""
         self._stopwatch.on_phase(name)
         self._within.append(name)
         if self._console.is_terminal:
@@ -83,7 +82,6 @@ class Progress(Callback):
             self._printed = name
 
     def on_progress(self, share: float) -> None:
-        """Display the progress of the innermost phase."""
         now = time.perf_counter()
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], total=1.0, completed=share)
@@ -91,7 +89,6 @@ class Progress(Callback):
             self._print(f"{self._within[-1]} {100 * share:.0f}%")
 
     def on_phase_end(self, name: str) -> None:
-        """Return to the enclosing phase."""
         self._stopwatch.on_phase_end(name)
         self._within.pop()
         self._close()

@@ -115,7 +115,6 @@ class Refinement(Callback):
             record["resolution"] = {key: run.parameters[key].shape[:-1] for key in keys}
 
     def warnings(self, run: Run) -> list[str]:
-        """Return warnings about parameters that did not reach their scene's resolution."""
         return unfinished(run) if run.stopped else []
 
 
@@ -221,7 +220,6 @@ class OtherStart(Callback):
     """
 
     def before_step(self, run: Run) -> None:
-        """Compare values once, and begin again at better ones."""
         state, problem = run.state, run.problem
         if not run.plan.other_starts or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
             return
@@ -246,6 +244,5 @@ class OtherStart(Callback):
             )
 
     def on_result(self, run: Run, result: Result) -> Result:
-        """Add the line about another start."""
         line = run.state.other_start
         return replace(result, adapted=[*result.adapted, line]) if line not in ("", _KEPT) else result

@@ -29,12 +29,11 @@ class Result:
             colours are means over the last steps where these have become stationary; `adapted` contains the number of these steps.
         initial: {key: array}, the initial values.
         last: {key: array}, the values after the last step; equal to `parameters` unless means or earlier values were better.
-        history: one dictionary per step (in a run folder with millions of steps, per second, fourth, ... of the earlier ones): "step"
-            (from 0), "seconds" (of optimisation so far, without warm-up and callbacks), "loss", "samples" (paths traced so far),
-            "gradient_noise" (fraction in [0, 1] or None), and, if the truth is known, "parameter_error" ({key: error}, see
-            `Problem.parameter_error`) at intervals and at the last step. For parameters with a coarse initial resolution, "resolution"
-            ({key: texels along each axis}) at the first step of each resolution. For meshes, "faces" ({key: number of triangles}) at the
-            first step after each remeshing.
+        history: one dictionary per step (in a run folder with millions of steps, per second, fourth, ... of the earlier ones): "step" (from
+            0), "seconds" (of optimisation so far, without warm-up and callbacks), "loss", "samples" (paths traced so far), "gradient_noise"
+            (fraction in [0, 1] or None), and, if the truth is known, "parameter_error" ({key: error}, see `Problem.parameter_error`) at
+            intervals and at the last step. For parameters with a coarse initial resolution, "resolution" ({key: texels along each axis}) at
+            the first step of each resolution. For meshes, "faces" ({key: number of triangles}) at the first step after each remeshing.
         seconds: seconds of optimisation.
         warmup_seconds: seconds of tracing and compiling kernels before the first step.
         stopped: "steps", "seconds" or "callback" (finished); "interrupted" (Ctrl-C, or a stop command) or "terminated"
@@ -140,9 +139,8 @@ class Result:
     def status(self) -> str:
         """End of the run: "finished", "interrupted" or "failed".
 
-        A run that used up its budget may also be "worse than start" (the final image is worse than the initial one), "memory disagrees"
-        (a control variate differs from a new image), or "does not fit" (the final image differs from the references
-        after enough steps).
+        A run that used up its budget may also be "worse than start" (the final image is worse than the initial one), "memory disagrees" (a
+        control variate differs from a new image), or "does not fit" (the final image differs from the references after enough steps).
         """
         if self.stopped in (INTERRUPTED, TERMINATED):
             return "interrupted"

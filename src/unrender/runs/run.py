@@ -318,8 +318,7 @@ class GradientNoise:
         """Add a gradient, and return the fraction in [0, 1]; None for fewer than ten gradients without variance, and for a zero gradient.
 
         With the estimator's variance, the result is its fraction of ‖g‖². Gradients of an estimator that reuses earlier samples resemble
-        each other, and would otherwise appear free of noise. `whole` are gradients that have a full mean,
-        for `free_of_bounds`.
+        each other, and would otherwise appear free of noise. `whole` are gradients that have a full mean, for `free_of_bounds`.
         """
         whole = whole or {}
         sampled = self._follow(gradient | whole if variance is None else whole, whole)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unrender.core import arrays, memory
-from unrender.core.welding import weld
+from unrender.core.geometry import weld
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
 from unrender.optimizers import rates

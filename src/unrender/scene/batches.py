@@ -252,7 +252,6 @@ class JoinedViews(PixelBatch):
 
     @cached_property
     def complete_views(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
-        """Slice and (height, width) of each view, in order."""
         sizes = self.problem.sizes[self.views.start : self.views.stop]
         return tuple(zip(slices_of_images(sizes), sizes, strict=True))
 

@@ -14,7 +14,7 @@ from unrender.core import arrays
 from unrender.io import scene_files
 from unrender.rendering.expressions import expression_layer
 from unrender.rendering.renderer import Renderer
-from unrender.rendering.worlds import World, WorldsRenderer
+from unrender.rendering.worlds import WorldsRenderer
 from unrender.rendering.wrapper import layers
 from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
@@ -87,10 +87,11 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
     if (layer := expression_layer(problem.renderer)) is not None:
         parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
+    worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
     for index, view in enumerate(problem.original_views):
         if not view.own_world:
             continue
-        world = _world(problem, index)
+        world = None if worlds is None else worlds.state_of(problem.views[index].sensor)  # None if it only turns lights
         values = view.known or {} if world is None else world.values
         fields = {f"known {key}": _of_array(np.asarray(x, np.float32)) for key, x in sorted(values.items())}
         if isinstance(view.scene, (str, Path)):
@@ -111,12 +112,6 @@ def _of_scene(problem: Problem) -> dict[str, str]:
     if len(objects) > _MOST_OBJECTS:
         return {"scene": digest(*(part for parts in objects.values() for part in parts))}
     return {f"scene: {name}": digest(*parts) for name, parts in objects.items()}
-
-
-def _world(problem: Problem, view: int) -> World | None:
-    """Return the world of a view that has its own; None if it only turns lights."""
-    worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
-    return None if worlds is None else worlds.state_of(problem.views[view].sensor)
 
 
 def _objects(renderer: Renderer, without: Container[str] = ()) -> dict[str, list[bytes]]:

@@ -11,8 +11,8 @@ import numpy as np
 from unrender.core import checks, tables
 from unrender.core.checks import NotNegative, Positive
 from unrender.core.errors import InputError
+from unrender.core.geometry import weld
 from unrender.core.text import did_you_mean
-from unrender.core.welding import weld
 from unrender.io.toml_lines import FieldError
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.renderer import ReplacedMesh

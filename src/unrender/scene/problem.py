@@ -75,8 +75,7 @@ class Problem(ViewLosses):
             whose shape is its own.
         truth: {key: value} of parameters with a known true value, to measure the error; values as for `Parameter.initial`.
         name: name for display; None takes the name of the scene file.
-        surfaces: {key: `scene.surfaces.Surface`} of vertex positions whose true surface is known, but not the true position of each
-            vertex.
+        surfaces: {key: `scene.surfaces.Surface`} of vertex positions whose true surface is known, but not the true position of each vertex.
         partial: whether other views, which this object does not have, may determine an unknown that all of its views know.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.welding import weld
+from unrender.core.geometry import weld
 
 _SAMPLES = 2000
 """Number of sample points on each surface."""
@@ -242,10 +242,11 @@ def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: 
         vertices = start + (end - start) * 0.5**halving
         if not turned(vertices).any():
             return vertices.reshape(-1).astype(after.dtype)
-    stays = np.zeros(len(start), bool)
+    stays, (_, places) = np.zeros(len(start), bool), weld(start)
     while (over := turned(vertices) & ~stays[faces].all(axis=1)).any():
         stays[faces[over]] = True
-        vertices = np.where(_at_same_place(stays, start)[:, None], start, vertices)
+        stays |= np.bincount(places, weights=stays)[places] > 0  # with others at their positions, as on seams
+        vertices = np.where(stays[:, None], start, vertices)
     return vertices.reshape(-1).astype(after.dtype)
 
 
@@ -253,10 +254,3 @@ def _joined(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return faces with each vertex replaced by the first vertex at its position."""
     first, places = weld(vertices)
     return first[places][faces]
-
-
-def _at_same_place(chosen: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Extend the chosen vertices (V,) by all others at their positions, as on both sides of seams. Modifies `chosen`."""
-    _, places = weld(vertices)
-    chosen |= np.bincount(places, weights=chosen)[places] > 0
-    return chosen

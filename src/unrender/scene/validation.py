@@ -95,7 +95,10 @@ def check_parameter(
     with checking("bounds"):
         bounds, narrowed = check_bounds(parameter.bounds, info, start)
     with checking("learning_rate"):
-        rate = _check_rate(parameter.learning_rate)
+        rate = parameter.learning_rate
+        if rate is not None and (not is_number(rate) or rate <= 0):
+            raise InputError(f"expected a number above 0, got {rate!r}")
+        rate = None if rate is None else float(rate)
     parameterisation, transform = None, None
     with checking("preconditioner"):
         preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
@@ -143,12 +146,6 @@ def _bound_prior(prior: Any, info: ParameterInfo, initial: np.ndarray) -> Prior:
     return tables.options(Prior, prior, "{ smoothness = 0.05 }").on(
         initial, info.conversion.repeated, mesh_topology(info), info.welded
     )
-
-
-def _check_rate(rate: Any) -> float | None:
-    if rate is not None and (not is_number(rate) or rate <= 0):
-        raise InputError(f"expected a number above 0, got {rate!r}")
-    return None if rate is None else float(rate)
 
 
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:

@@ -2,9 +2,8 @@
 
 Symbols: roughness α; normal distribution D; angle θ between microfacet normal and surface normal; t = tan²θ / α², the squared slope in
 units of α. D cosθ is a density over directions with integral 1 for every α, so (∂D/∂α) cosθ has integral 0. The derivative is negative in
-the inner part, t < 1, and positive in the outer part, t > 1. Both parts have the same mass. Belhe et al. 2024 cut at the same sign
-change. For u in (0, 1], both parts have the same fraction of their mass between t(u) and 1, which pairs each inner normal with an outer
-one.
+the inner part, t < 1, and positive in the outer part, t > 1. Both parts have the same mass. Belhe et al. 2024 cut at the same sign change.
+For u in (0, 1], both parts have the same fraction of their mass between t(u) and 1, which pairs each inner normal with an outer one.
 """
 
 from __future__ import annotations

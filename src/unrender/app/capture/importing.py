@@ -255,7 +255,6 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
 
 
 def _capture(folder: Path, options: ImportOptions) -> Capture:
-    """Read the capture of the folder, in the selected conventions."""
     capture = formats.read(folder, options.kind, options.masks)
     if options.axes is not None or options.world_to_camera is not None:
         inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera

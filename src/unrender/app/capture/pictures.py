@@ -169,7 +169,6 @@ def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
 
 @contextmanager
 def _errors_of_pillow(path: Path) -> Iterator[None]:
-    """Raise `InputError` for exceptions of the calls of Pillow inside."""
     try:
         yield
     except (InputError, MemoryError):

@@ -19,7 +19,7 @@ from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
-from unrender.core.rotations import MITSUBA_TO_OPENGL
+from unrender.core.geometry import MITSUBA_TO_OPENGL
 from unrender.core.text import printable
 from unrender.io import images
 

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from importlib import metadata
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from unrender.app.cli.catalogue import gallery, methods
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import ProblemSettings, Variant
 from unrender.app.cli.compare import compare
 from unrender.app.cli.import_ import import_
 from unrender.app.cli.results import export, judge, report, turntable, watch
 from unrender.app.cli.run import resume, run
 from unrender.app.cli.sweep import sweep_command
+from unrender.core.errors import InputError
+from unrender.display.terminal import Console
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from unrender.methods import Method
 
 app = typer.Typer(
     help="Recover the parameters of a scene (textures, materials, lights) from images.",
@@ -31,8 +39,96 @@ app.command()(export)
 app.command()(judge)
 app.command()(turntable)
 app.command("import")(import_)
-app.command()(gallery)
-app.command()(methods)
+
+
+@app.command()
+def gallery(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this problem.")] = None,
+) -> None:
+    """List the gallery's problems, or the options of one."""
+    from rich.markup import escape
+
+    from unrender import gallery as problems
+
+    console, table = Console(highlight=False), _table()
+    if name is None:
+        for known in problems.names():
+            table.add_row(known, escape(problems.summary(known)))
+    else:
+        console.print(f"[bold]{escape(name)}[/]  {escape(problems.summary(name))}", soft_wrap=True)
+        for option in problems.options(name):
+            default = option.default if isinstance(option.default, (int, float, str)) else type(option.default).__name__
+            table.add_row(f"  {option.name}", str(default), escape(option.about))
+    console.print(table)
+
+
+def _table() -> Table:
+    from rich.table import Table
+
+    return Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+
+
+@app.command()
+def methods(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show this method only.")] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(metavar="PROBLEM", help="Print the plan of NAME, or of auto, for this problem, as a plan file."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", metavar="NAME=VALUE", help="With --plan: an option of the method. Repeatable."),
+    ] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+) -> None:
+    """List the methods, their options and defaults.
+
+    With --plan, print all that a method decides for a problem. `unrender run PROBLEM --method FILE.toml` runs such a file.
+    """
+    from rich.markup import escape
+
+    if plan is not None:
+        _print_plan(plan, name or "auto", arguments.settings(settings, "--set"), problem_settings, variant)
+        return
+    if unused := arguments.typed_options(context):
+        raise InputError(f"methods: {unused[0]} needs --plan PROBLEM")
+    from unrender.methods import method
+    from unrender.methods import methods as registered
+
+    console = Console(highlight=False)
+    for one in [method(name)] if name else registered().values():
+        console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
+        console.print(_method_options(one))
+        console.print()
+
+
+def _print_plan(
+    problem: str, name: str, settings: dict[str, str], problem_settings: list[str] | None, variant: str
+) -> None:
+    from unrender.methods import method
+    from unrender.methods.plan import plan_text
+
+    chosen, options = method(name), arguments.settings(problem_settings, "--problem-set")
+    chosen.start(settings)
+    arguments.check_problem(problem, options)
+    arguments.use_variant(variant)
+    print(plan_text(chosen.plan(arguments.open_problem(problem, options), settings)), end="")
+
+
+def _method_options(one: Method) -> Table:
+    from rich.markup import escape
+
+    table = _table()
+    table.add_column(overflow="fold")
+    table.add_column(overflow="fold")
+    table.add_column(overflow="fold")
+    for name, field in one.options.model_fields.items():
+        default = "none" if field.default is None else str(field.default)
+        about = f"{field.description} ({one.expected(name)})"
+        table.add_row(f"  {name}", escape(default), escape(about))
+    return table
 
 
 @app.command("doctor")

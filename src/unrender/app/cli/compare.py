@@ -232,16 +232,12 @@ def _here(
 
     outcomes: list[RunOutcome] = []
     for run in runs:
-        console.print(f"[bold]{run.method}[/], seed {run.seed}, {_budget(run)}")
+        limits = (f"{limit:g} {unit}" for unit, limit in (("steps", run.steps), ("s", run.seconds)) if limit)
+        console.print(f"[bold]{run.method}[/], seed {run.seed}, {', '.join(limits)}")
         outcomes.append(tasks.carry_out(job, run, problem, console, progress))
         if outcomes[-1].status == "interrupted":
             break
     return outcomes
-
-
-def _budget(run: RunTask) -> str:
-    limits = (("steps", run.steps), ("s", run.seconds))
-    return ", ".join(f"{limit:g} {unit}" for unit, limit in limits if limit is not None)
 
 
 def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cluster) -> list[RunOutcome]:
@@ -285,7 +281,6 @@ def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cl
 
 
 def _methods_and_settings(names: str | None, typed: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Return the validated settings of each method, by name. Raise `InputError`."""
     chosen = _parse_methods(names)
     by_method = _settings_by_method(chosen, typed)
     for one in chosen:

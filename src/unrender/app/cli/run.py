@@ -131,7 +131,6 @@ def run(
 
 
 def _method(name: str) -> Method | PlanFile:
-    """Return the method of a name, or the plan of a TOML file. Raises `InputError`."""
     from unrender.methods import method
     from unrender.methods.plan import SUFFIX, PlanFile
 

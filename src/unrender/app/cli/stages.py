@@ -254,7 +254,6 @@ def _read(stages: Stages) -> StagedProblem:
 
 
 def _status(folder: Path) -> str:
-    """Return the status of a stage; "" before its start."""
     from unrender.runs.folder import reader, schema
 
     return reader.read_run_record(folder).status if (folder / schema.RECORD).is_file() else ""

@@ -91,13 +91,14 @@ def sweep_command(
     folder, one per seed, in one folder with sweep.json. `unrender sweep DIR` continues an interrupted or killed sweep.
     """
     arguments.budget(steps, seconds)
+    from unrender import gallery
     from unrender.app.cli.sweep_driver import Session, run_trials
     from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console
 
     console = Console(highlight=False)
     where = arguments.workers(workers, insecure)
-    if _is_sweep(what):
+    if Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names()):
         if refused := arguments.typed_options(context, _FREE):
             raise InputError(f"sweep {what}: continues with its original options; leave out {refused[0]}")
         record = _extended(read_sweep(Path(what)), trials)
@@ -197,17 +198,9 @@ def _texts(values: Mapping[str, Any] | None) -> dict[str, str]:
     return {name: as_text(value) for name, value in (values or {}).items()}
 
 
-def _is_sweep(what: str) -> bool:
-    """Return whether the argument is a folder, and not a gallery problem of the same name."""
-    from unrender import gallery
-
-    return Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names())
-
-
 def _planned(
     values: dict[str, Any], over: Sequence[str] | Mapping[str, str | Sequence[Any]]
 ) -> tuple[SweepPlan, Search]:
-    """Return the plan of a sweep and its search. Raises `InputError`."""
     from unrender.app.sweeps.record import SweepPlan
     from unrender.app.sweeps.search import parse_axes
     from unrender.methods import method
@@ -240,7 +233,6 @@ def _begin(console: Console, planned: tuple[SweepPlan, Search], command: str, se
 
 
 def _kind(search: str | None, axes: Any) -> Any:
-    """Return the search by name. Raises `InputError`."""
     from unrender.core.text import did_you_mean
 
     if search is None:
@@ -254,7 +246,6 @@ def _kind(search: str | None, axes: Any) -> Any:
 
 
 def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
-    """Return the plan with its number of trials, and its search. Raises `InputError`."""
     from unrender.app.sweeps.search import TPE, Grid, Random, parse_axes
     from unrender.methods import method
 

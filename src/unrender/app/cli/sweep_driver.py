@@ -321,7 +321,6 @@ def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
 
 
 def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
-    """Return the runs of a trial."""
     return [
         RunTask(
             run_name(started.number, plan.seed + i),

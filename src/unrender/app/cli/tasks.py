@@ -80,7 +80,9 @@ def open_job(job: Job) -> Iterator[None]:
 def carry_out(job: Job, task: RunTask, problem: Problem, console: Console, progress: Progress) -> RunOutcome:
     """Run a task, or continue its earlier attempt, and return its outcome. Raise `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)
-    _wait_until_free(folder)
+    until = time.monotonic() + _PATIENCE_SECONDS
+    while time.monotonic() < until and holder(folder) is not None:
+        time.sleep(0.2)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
     started = progress.budget_began = time.perf_counter()
     if record is None or record.status not in ENDED:
@@ -158,7 +160,6 @@ def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOut
 
 @functools.lru_cache(maxsize=1)
 def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> Problem:
-    """Return the problem, opened once per process."""
     return arguments.open_problem(name, dict(options), cached)
 
 
@@ -166,18 +167,11 @@ def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> P
 
 
 def _resumed(folder: Path, problem: Problem, progress: Progress) -> bool:
-    """Resume the run from its last checkpoint if possible; return whether this succeeded."""
     try:
         resumed(load_run(folder), problem, progress)
     except InputError:
         return False
     return True
-
-
-def _wait_until_free(folder: Path) -> None:
-    until = time.monotonic() + _PATIENCE_SECONDS
-    while time.monotonic() < until and holder(folder) is not None:
-        time.sleep(0.2)
 
 
 def _finite(number: float | None) -> Any:

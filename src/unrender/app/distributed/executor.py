@@ -320,7 +320,6 @@ class DistributedExecutor:
         raise InputError(f"workers: some were lost {_MOST_LOSSES} times while their memory was collected")
 
     def _views(self, recipe: Recipe) -> tuple[Any, ...]:
-        """Return the memory of each view, in the views' order."""
         self._collect(recipe)
         assert recipe.stored is not None
         by_view: dict[int, Any] = {}

@@ -48,6 +48,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
             f"workers: {problem.name} has camera parameters of photographs and views of different scenes, which workers do not "
             "support together; leave --workers out"
         )
+    layer = expression_layer(problem.renderer)
     parts = _Parts(
         _scene(problem),
         parameters,
@@ -56,7 +57,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
         requested_depth(problem.renderer, problem.original_views, problem.max_depth),
         problem.name,
         sensors,
-        _expressions(problem),
+        {} if layer is None else {one.key: one.text or one.function for one in layer.expressions},
     )
     buffer = io.BytesIO()
     try:
@@ -90,11 +91,6 @@ def unpacked(blob: bytes, ray: Any) -> Problem:
         expressions=parts.expressions,
         partial=True,
     )
-
-
-def _expressions(problem: Problem) -> dict[str, Any]:
-    layer = expression_layer(problem.renderer)
-    return {} if layer is None else {one.key: one.text or one.function for one in layer.expressions}
 
 
 def _scene(problem: Problem) -> Any:

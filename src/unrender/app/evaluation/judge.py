@@ -123,7 +123,10 @@ def judge(
         with tempfile.TemporaryDirectory() as scratch:
             images, relit, albedo = _render(target, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
-            images, relit = _as_films(target, relit), []
+            # as the films of the views store them, which their photographs contain
+            grey = [format_of(target.renderer, view.sensor).colour == "luminance" for view in target.views]
+            images = [np.repeat(luminance(x), 3, axis=2) if of else x for x, of in zip(relit, grey, strict=True)]
+            relit = []
         if measured:
             images = _photographed(target, images, of_camera, exposed)
         measures = _measure(target, images) if measured else []
@@ -138,12 +141,6 @@ def judge(
     if not measured:
         notices.append("nothing is measured: the photographs show another light; see --held-out")
     return Judgement(place, tuple(names_of(target)), tuple(measures), albedo, tuple(notices))
-
-
-def _as_films(problem: Problem, images: list[np.ndarray]) -> list[np.ndarray]:
-    """Return RGB images as the films of the views store them, which their photographs contain: those of luminance are grey."""
-    grey = [format_of(problem.renderer, view.sensor).colour == "luminance" for view in problem.views]
-    return [np.repeat(luminance(x), 3, axis=2) if of else x for x, of in zip(images, grey, strict=True)]
 
 
 def _recovered(run: Path, problem: Problem, result: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

@@ -19,7 +19,7 @@ from unrender.backend import variant
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.core.rotations import rotation
+from unrender.core.geometry import rotation
 from unrender.display.pictures import quantized
 from unrender.io import files
 from unrender.losses.metrics import exposure, srgb

@@ -17,7 +17,7 @@ import numpy as np
 from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
-from unrender.core.rotations import MITSUBA_TO_OPENGL
+from unrender.core.geometry import MITSUBA_TO_OPENGL
 from unrender.display.pictures import png
 
 _FLOAT, _UNSIGNED = 5126, 5125

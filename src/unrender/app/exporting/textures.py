@@ -35,8 +35,7 @@ def write(
 
     Args:
         parameters: {key: array}.
-        related: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or
-            .npy.
+        related: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or .npy.
     """
     notices: list[str] = []
     record: dict[str, Any] = {}

@@ -157,8 +157,7 @@ def relative_error(run: RunFolder, keys: Sequence[str], start: Mapping[str, floa
 
 
 def image_error(run: RunFolder) -> float | None:
-    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without
-    pictures."""
+    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without pictures."""
     return _mean([metrics.rmse(view.result, view.reference, view.mask) for view in run.views.values()])
 
 

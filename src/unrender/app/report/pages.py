@@ -16,7 +16,7 @@ import numpy as np
 from unrender.app.report import curves, html, panels, tables
 from unrender.app.report import groups as grouping
 from unrender.app.report.equal_time import Comparison, compare_groups
-from unrender.core.rotations import rotation
+from unrender.core.geometry import rotation
 from unrender.display import formatting, plots
 from unrender.display.pictures import data_uri
 from unrender.display.plots import Chart, Line

@@ -81,7 +81,6 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
 
 
 def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> list[Figure]:
-    """Return the figures of the control weight and of the pixel probability of the method, if it has them."""
     figures = []
     if shown.control_weight is not None:
         weight = np.mean(shown.control_weight, axis=-1)

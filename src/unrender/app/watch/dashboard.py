@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -99,7 +98,9 @@ def render(template: str, snapshots: Sequence[Snapshot], pictures: PictureCache,
     `chosen` and `view` are indices of the run and of the view whose pictures are shown; the first one for an index out of range.
     """
     pictures.start_page()
-    labels = _labels([snapshot.path for snapshot in snapshots])
+    paths = [snapshot.path for snapshot in snapshots]
+    names = [path.resolve().name or str(path) for path in paths]
+    labels = [str(path) if names.count(name) > 1 else name for name, path in zip(names, paths, strict=True)]
     chosen = chosen if 0 <= chosen < len(snapshots) else 0
     run = snapshots[chosen].run
     with np.errstate(all="ignore"):  # pictures of a diverging run overflow, but are shown nevertheless
@@ -187,12 +188,6 @@ def _notices(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> list[str]:
         fields = [*snapshot.problems, *(snapshot.run.record.warnings if snapshot.run is not None else ())]
         lines += [who + line for line in fields]
     return lines
-
-
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """Return the names of the folders; their full paths where names repeat."""
-    names = [path.resolve().name or str(path) for path in paths]
-    return [str(path) if names.count(name) > 1 else name for name, path in zip(names, paths, strict=True)]
 
 
 @cache

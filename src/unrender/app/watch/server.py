@@ -209,7 +209,6 @@ class _Page:
         return Response(picture.png(2.0**stops, effort=1), media_type="image/png")
 
     async def control(self, request: Request) -> Response:
-        """Write a command into the run's folder."""
         digits = request.path_params["run"]
         known = len(digits) <= _LONGEST_NUMBER and digits.isascii() and digits.isdigit()
         if not known or int(digits) >= len(self._monitors):

@@ -201,8 +201,7 @@ def estimate_gradient_and_product(
 
     They are the mean and the difference (Eq. 23) of the gradients at θ ± ε u, where u is v scaled to one σ, with the same samples. The
     gradient is therefore that of f with additional smoothing along v by ε σ. Samples are from the aggregate, and antithetic;
-    `options.samples`, at least 4, counts all evaluations. For a single sample, the magnitude of the gradient replaces its standard
-    error.
+    `options.samples`, at least 4, counts all evaluations. For a single sample, the magnitude of the gradient replaces its standard error.
     """
     function = SmoothedFunction("gradient", f, theta, sigma, options)
     function.draws = max(options.samples // 4, 1)

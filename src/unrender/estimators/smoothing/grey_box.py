@@ -110,8 +110,7 @@ def newton_cg_step(
 ) -> float:
     """Update a network's weights in place by one Newton step with conjugate gradients; see `optimizers.NewtonCG` (Eqs 4 to 7).
 
-    It needs a few vectors of the weights' size in addition to what PyTorch stores for the loss. A step takes at most `iterations`
-    products.
+    It needs a few vectors of the weights' size in addition to what PyTorch stores for the loss. A step takes at most `iterations` products.
 
     Args:
         loss_fn: the loss, a scalar tensor that PyTorch can differentiate twice, such as the mean of `loss`; called once.
@@ -120,9 +119,8 @@ def newton_cg_step(
         iterations: maximum number of products with the Hessian, >= 1.
         optimizer: a PyTorch optimizer of the same weights, such as `torch.optim.Adam`, which receives the negative step as its gradient;
             None to apply the step itself.
-        scales: for each weight that requires a gradient a tensor of its shape, > 0: directions, and the trust radius, refer to the
-            weights over their scales. With the fourth root of 1 / v, where v is Adam's mean square of the gradient, the first direction
-            is Adam's.
+        scales: for each weight that requires a gradient a tensor of its shape, > 0: directions, and the trust radius, refer to the weights
+            over their scales. With the fourth root of 1 / v, where v is Adam's mean square of the gradient, the first direction is Adam's.
 
     Returns:
         The loss before the step.

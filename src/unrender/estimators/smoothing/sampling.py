@@ -205,5 +205,4 @@ class SmoothedFunction:
 
 
 def _open_interval(u: np.ndarray) -> np.ndarray:
-    """Return uniform numbers clipped away from 0 and 1."""
     return np.clip(u, 2.0**-53, 1 - 2.0**-53)

@@ -264,7 +264,6 @@ class _PrintableLog(mi.Appender):
     """Appender that writes Mitsuba's messages to standard error."""
 
     def append(self, level: Any, text: str) -> None:
-        """Write one message of any level."""
         del level
         print(one_line(" ".join(text.split())), file=sys.stderr)
 

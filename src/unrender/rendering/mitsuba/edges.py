@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.backend import variant
-from unrender.core.welding import weld
+from unrender.core.geometry import weld
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, scene_of
@@ -168,7 +168,8 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     spheres = [
         shape
         for shape in spheres
-        if not (shape.is_emitter() or shape.is_sensor() or shape.is_medium_transition() or _is_specular(shape.bsdf()))
+        if not (shape.is_emitter() or shape.is_sensor() or shape.is_medium_transition())
+        and not mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)
     ]
     if not spheres or any(sensor.get_shape() is not None for sensor in scene.sensors()):
         return scene, []
@@ -182,10 +183,6 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     own = [] if scene.integrator() is None else [scene.integrator()]
     return scene_of([*objects, *scene.sensors(), *own]), replaced
-
-
-def _is_specular(bsdf: Any) -> bool:
-    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
 
 def _mesh(sphere: Any) -> Any:

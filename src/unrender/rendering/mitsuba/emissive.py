@@ -65,11 +65,6 @@ def harmonics(d: Any, count: int) -> list[Any]:
     return values
 
 
-def _positive(x: Any) -> Any:
-    """Return s log(1 + exp(x / s)), without overflow."""
-    return dr.maximum(x, 0) + _SOFTNESS * dr.log(1 + dr.exp(-dr.abs(x) / _SOFTNESS))
-
-
 @cache
 def _plugin(variant: str) -> type:
     del variant  # a cache key only: the base class belongs to the active variant
@@ -119,7 +114,8 @@ def _plugin(variant: str) -> type:
                 return value
             for volume, Y in zip(self.more, harmonics(mei.wi, len(self.more) + 1)[1:], strict=True):
                 value = dr.fma(volume.eval(mei, active), Y, value)
-            return _positive(value)
+            # s log(1 + exp(x / s)), without overflow
+            return dr.maximum(value, 0) + _SOFTNESS * dr.log(1 + dr.exp(-dr.abs(value) / _SOFTNESS))
 
         def intersect_aabb(self, ray: Any) -> Any:
             return self.sigma_t.bbox().ray_intersect(ray)

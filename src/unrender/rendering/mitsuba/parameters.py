@@ -91,7 +91,8 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
     """
     leaf = key.rsplit(".", 1)[-1]
     node = parameters.properties[key][2]
-    if isinstance(node, mi.Mesh) and _is_attribute(leaf):
+    attribute = leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
+    if isinstance(node, mi.Mesh) and attribute:
         readers = graph.attribute_readers(node, leaf)
         chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
         return functools.reduce(_combined, [_traits_of(chain, key) for chain in chains], ParameterTraits(False, ""))
@@ -99,11 +100,6 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
     # a texture that the scene itself holds has no effect there
     effective = [chain for chain in chains if len(chain) > 2] or chains
     return functools.reduce(_combined, [_traits_of(chain, key) for chain in effective])
-
-
-def _is_attribute(leaf: str) -> bool:
-    """Return whether a mesh's parameter is an attribute that textures read."""
-    return leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
 
 
 def _combined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:

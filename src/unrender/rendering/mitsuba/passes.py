@@ -159,15 +159,12 @@ class MovedPairPass(Pass):
     still_sensors: bool
 
     def scene(self, pair: ScenePair) -> Any:
-        """Return both scenes."""
         return pair.current, pair.previous
 
     def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
-        """Return both scenes, or one if both have the same sensors."""
         return (pair.current,) if self.still_sensors else (pair.current, pair.previous)
 
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
-        """Return the tables of `MovedPair.sample`."""
         return pair.moved_tables(self.moving)
 
     def function(
@@ -285,7 +282,6 @@ class PosesPass(Pass):
         return hash((id(self.posed), self.copies))
 
     def scene(self, pair: ScenePair) -> Any:
-        """Return the static scene and those of the posed shapes."""
         return self.posed.scenes()
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:

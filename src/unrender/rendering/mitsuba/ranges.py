@@ -216,7 +216,8 @@ class SlotReaders:
         """Return the range that is valid for all slots that hold a texture or volume."""
         result: Range | None = None
         for holder, slot in self._holders.get(node, []):
-            if isinstance(holder, mi.Medium) and slot == "emission" and _has_harmonics(holder):
+            harmonic = isinstance(holder, mi.Medium) and any(name == f"{COEFFICIENT}1" for name, _ in children(holder))
+            if harmonic and slot == "emission":
                 each = Range(unit="radiance")
             else:
                 each = self._of_slot(holder, slot)
@@ -253,7 +254,3 @@ def entry(node: Any, slot: str) -> Range | None:
         return own[slot]
     kind = next((KINDS[name] for name in _KINDS if isinstance(node, getattr(mi, name))), {})
     return kind.get(slot)
-
-
-def _has_harmonics(medium: Any) -> bool:
-    return any(name == f"{COEFFICIENT}1" for name, _ in children(medium))

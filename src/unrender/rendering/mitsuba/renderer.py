@@ -115,7 +115,8 @@ class MitsubaRenderer:
         self._info |= {
             key: poses.info(
                 pose,
-                self._obstacle_of(pose, obstacles_of[pose.target]) or self._translates(pose),
+                ("" if pose.smooth and not self.pair.volumetric else obstacles_of[pose.target])
+                or self._translates(pose),
                 sensors.get(pose.target),
                 lengths_by_id.get(pose.target, 1.0),
             )
@@ -284,10 +285,6 @@ class MitsubaRenderer:
         """Return the reason why the translation of a sensor has no derivative; "" for other poses or if it has one."""
         moves = pose.part == "translation" and any(sensor.id() == pose.target for sensor in self.pair.current.sensors())
         return translation_obstacle(self.pair) if moves else ""
-
-    def _obstacle_of(self, pose: poses.PoseKey, of_target: str) -> str:
-        """Return the reason why a pose has no path gradient, from that of its target; "" if it has one."""
-        return "" if pose.smooth and not self.pair.volumetric else of_target
 
     def _obstacles(self, targets: set[str]) -> dict[str, str]:
         """Return {shape or sensor that moves: reason why it has no path gradient, "" if it has one}."""

@@ -214,7 +214,6 @@ def _visitor(_variant: str) -> type:
                 self._enter(*arguments)
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            """Add a value or an object."""
             if isinstance(value, mi.Object):
                 self.put_object(name, value, flags)
             else:
@@ -228,7 +227,6 @@ def _visitor(_variant: str) -> type:
                 self.graph.properties[self.full(name)] = value, cpptype, self.node, self.flags | flags
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
-            """Add an object, immediately or deferred."""
             if self.depth == 0 and isinstance(value, mi.Texture):
                 self.deferred.append((name, value, flags))
             elif value is not None:

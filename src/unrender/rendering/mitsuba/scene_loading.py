@@ -187,7 +187,6 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
 
 
 def _children(nodes: Any, node: Any) -> dict[str, Any]:
-    """Return the nodes that a node holds, by property."""
     return {name: nodes[index] for name, index in references(node.props)}
 
 

@@ -381,7 +381,9 @@ class MitsubaSession:
         key = (task, size, request.groups, several, outside, shapes, *absent)
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
-            traced = task.function(self._kernel_of(task), self._sampler, size, posed)
+            posing = isinstance(task, PosesPass)
+            kernel = self._geometry_kernel if self._geometric and not posing else self._path_kernel
+            traced = task.function(kernel, self._sampler, size, posed)
             self._functions[key] = FrozenFunction(traced, self._recordable, self._attached)
         share_addresses()
         scenes, films = [loaded.scene for loaded in loaded_scenes()], pair.films(request)
@@ -394,6 +396,3 @@ class MitsubaSession:
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
         return partial(self._functions[key], prepare, scene, scenes, tables, seeds, request.pixels, films, rays)
-
-    def _kernel_of(self, task: Pass) -> Kernel:
-        return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

@@ -165,7 +165,6 @@ class RunWriter(Callback):
                 warm_up(run.problem, run.full(), self._tested)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """Append the step to the history, and write a checkpoint if due."""
         self.append(record)
         if self._history.size > max(THINNED_FROM, self._thin_from):
             self._guarded("history", lambda: self._thin(run.history))

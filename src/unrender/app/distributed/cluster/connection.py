@@ -187,15 +187,10 @@ def load_ray() -> Any:
             import ray
     except ImportError as error:
         raise InputError(f"workers need Ray ({error}): pip install 'unrender[ray]'") from error
-    _silence(ray)
-    return ray
-
-
-def _silence(ray: Any) -> None:
-    """Suppress Ray's messages about dead workers, which this package reports itself. Ray has no setting for this, so failures are
-    ignored."""
-    with contextlib.suppress(Exception):
-        ray._private.worker.print_to_stdstream = lambda *_, **__: None
+    loaded: Any = ray
+    with contextlib.suppress(Exception):  # no setting silences messages about dead workers, which are reported here
+        loaded._private.worker.print_to_stdstream = lambda *_, **__: None
+    return loaded
 
 
 @contextlib.contextmanager
@@ -243,7 +238,8 @@ def connect(
             check_private(ray)
         elif not workers.insecure and not _is_located(address):
             check_cluster(ray, gcs_address)
-        machines = _machines(ray)
+        alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        machines = [(resources.get("CPU", 0.0), resources.get("GPU", 0.0)) for resources in alive]
         if name == "auto" and address is not None:
             gpu = any(gpus >= 1 for _, gpus in machines)
         if name == "auto":
@@ -262,12 +258,6 @@ def _init(ray: Any, address: str | None, init_options: dict[str, Any]) -> None:
         except Exception as error:  # of many kinds
             reason = one_line(reason_of(error, 200))
             raise InputError(f"workers: Ray {where}: {reason}") from error
-
-
-def _machines(ray: Any) -> list[tuple[float, float]]:
-    """Return (cores, GPUs) of each machine of the cluster."""
-    alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    return [(resources.get("CPU", 0.0), resources.get("GPU", 0.0)) for resources in alive]
 
 
 def _is_located(address: str) -> bool:

@@ -152,10 +152,10 @@ class OnWorkers:
             if task.attempts < _ATTEMPTS:
                 self._start(_Begun(task.key, task.arguments, task.attempts + 1))
                 return None
-            return Ended(task.key, None, f"its worker died {task.attempts} times: {_death(error)}", task.attempts)
+            death = one_line(" ".join(str(error).split()).split(". ")[0][:200])  # without Ray's references to logs
+            return Ended(task.key, None, f"its worker died {task.attempts} times: {death}", task.attempts)
 
     def _cancel(self) -> None:
-        """Cancel all tasks, and wait a few seconds for them to stop."""
         with contextlib.suppress(Exception):
             for reference in self._begun:
                 self._ray.cancel(reference)
@@ -169,9 +169,3 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, UnrenderError):
         return one_line(text)
     return one_line(f"{type(error).__name__}: {text[:300]}" if text else type(error).__name__)
-
-
-def _death(error: BaseException) -> str:
-    """Return Ray's description of the death, without its references to logs."""
-    first = " ".join(str(error).split()).split(". ")[0]
-    return one_line(first[:200])

@@ -92,7 +92,6 @@ class WeightedPicture(Picture):
         return dr.dot(mi.Color3f(value), weights)
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
-        """Return the samples' contribution to Σ weights · image."""
         with dr.suspend_grad():
             weighted = dr.select(active, self.weighted(value, position, active), 0)
         return self.scale * dr.sum(weighted * motion)

@@ -77,11 +77,10 @@ class MovedPair:
 
         Args:
             scenes: the current and the previous scene.
-            tables: "shape" and "shape_back", maps between registry ids of the current and the previous scene's shapes; "triangles",
-                for each of the current scene's shapes the index of its first triangle in "area_ratios", 0 for static shapes;
-                "area_ratios", area in the previous over area in the current scene, 1 at index 0; "ellipsoids", see
-                `BoundingEllipsoids`, around everything that moves in either state; "emitters", ellipsoids around all emitters, or
-                None if they are unbounded or unknown.
+            tables: "shape" and "shape_back", maps between registry ids of the current and the previous scene's shapes; "triangles", for
+                each of the current scene's shapes the index of its first triangle in "area_ratios", 0 for static shapes; "area_ratios",
+                area in the previous over area in the current scene, 1 at index 0; "ellipsoids", see `BoundingEllipsoids`, around everything
+                that moves in either state; "emitters", ellipsoids around all emitters, or None if they are unbounded or unknown.
             sampler: seeded; both states use its numbers.
             choices: independent random numbers, which choose the reconnections.
             rays: camera rays of each state.

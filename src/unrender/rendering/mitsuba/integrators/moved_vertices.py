@@ -1,7 +1,6 @@
 """Vertices of the paths of two states with moving shapes, images of a vertex in the other state, and rays that are equal in both.
 
-Ellipsoids around moving shapes tell which rays are far from them.
-Symbols as in `path.py`; a subscript (ₚ) is the previous state.
+Ellipsoids around moving shapes tell which rays are far from them. Symbols as in `path.py`; a subscript (ₚ) is the previous state.
 """
 
 from __future__ import annotations

@@ -120,6 +120,7 @@ class PathPair:
         return context.connections
 
     def _begin(self, context: PathContext, ray: mi.RayDifferential3f, active: Bool | bool = True) -> PathState:
+        branches = self.differential is not None and not context.primal and not context.pair
         return PathState(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
@@ -130,7 +131,7 @@ class PathPair:
             η=mi.Float(1),
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
             active=mi.Bool(active),
-            branches=[BranchVertex.nowhere(mi.Ray3f(dr.detach(ray)))] if self._branches_off(context) else [],
+            branches=[BranchVertex.nowhere(mi.Ray3f(dr.detach(ray)))] if branches else [],
         )
 
     def _loop(self, context: PathContext, path: PathState, sampler: Any) -> dict[str, Any]:
@@ -286,9 +287,6 @@ class PathPair:
         path.δlogβ += δlogf
 
     # ------------------------------------------------------------------ differential paths
-
-    def _branches_off(self, context: PathContext) -> bool:
-        return self.differential is not None and not context.primal and not context.pair
 
     def _rough_lobe(
         self, context: PathContext, path: PathState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: Bool

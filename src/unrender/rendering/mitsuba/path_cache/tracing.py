@@ -58,7 +58,9 @@ class Lookups:
             raise InputError("paths through participating media are not cached")
         self._graph = pair.loaded(previous).graph
         self._graph.check_complete()
-        _check_plugins(self._graph)
+        for node in self._graph.nodes:  # one in Python may hold a texture without showing it to `mitsuba.traverse`
+            if type(node).__module__.partition(".")[0] not in _TRAVERSED:
+                raise InputError(f"paths are not cached with the Python plugin {type(node).__name__}")
         properties = pair.loaded(previous).parameters.properties
         surfaces: dict[Any, list[Any]] = {}
         emitters: dict[Any, None] = {}
@@ -137,13 +139,6 @@ def _check_around(owner: Any, around: Sequence[Any]) -> None:
     for item in around:
         if isinstance(owner, mi.Emitter) or not isinstance(item, mi.BSDF):
             raise ValueError(f"it is inside a {item.class_name()}")
-
-
-def _check_plugins(graph: ObjectGraph) -> None:
-    """Raise `InputError` for a Python plugin, which may hold a supported texture without showing it to `mitsuba.traverse`."""
-    for node in graph.nodes:
-        if type(node).__module__.partition(".")[0] not in _TRAVERSED:
-            raise InputError(f"paths are not cached with the Python plugin {type(node).__name__}")
 
 
 def _check_bsdfs(graph: ObjectGraph, bsdfs: Sequence[Any]) -> None:
