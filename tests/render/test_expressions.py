@@ -64,7 +64,7 @@ def problem(
     [
         ("2 * a + b", [2 + 3.0, 4 + 3.0]),
         ("a ** 2 - b / 4", [1 - 0.75, 4 - 0.75]),
-        ("-a[1] + [1, 2]", [-1.0, 0.0]),
+        ("-a[1] + [1, 2] + b ** 0.5 * 0", [-1.0, 0.0]),
         ("exp(log(a)) + sqrt(b) * 0", [1.0, 2.0]),
         ("max(a, 1.5) + min(b, 2)", [3.5, 4.0]),
         ("mix(a, b, 0.25) + abs(sin(0)) + cos(0) - 1 + tanh(0)", [1.5, 2.25]),
@@ -304,6 +304,8 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"expression": "strength +"}, r"it is no expression"),
         ({"expression": "-strength"}, r"outside of the range"),
         ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),
+        ({"expression": "sqrt(strength - 1)"}, r"its derivative by strength is not finite at the initial values"),
+        ({"expression": "(strength - 1) ** 0.5"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "strength * [1, 2]"}, r"has the shape \(2,\), lamp.intensity.value has \(3,\)"),
         ({"key": "lamp.colour"}, r"the scene has no parameter lamp.colour"),
         ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs an initial value"),

@@ -33,7 +33,9 @@ _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Sub: lambda a, b: a - b,
     ast.Mult: lambda a, b: a * b,
     ast.Div: lambda a, b: a / b,
-    ast.Pow: lambda a, b: a**b,
+    ast.Pow: lambda a, b: (
+        dr.sqrt(a) if isinstance(b, float) and b == 0.5 else a**b
+    ),  # Dr.Jit's derivative of 0 ** 0.5 is 0
 }
 _LONGEST, _DEEPEST = 1000, 50
 """Characters and nesting of a text form."""

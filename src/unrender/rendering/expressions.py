@@ -13,7 +13,7 @@ import numpy as np
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, listed
 from unrender.core.trees import Tree
 from unrender.io import bounded_files
 from unrender.rendering.expression_texts import Function, parse
@@ -156,6 +156,15 @@ class ExpressionRenderer(RendererWrapper):
             )
         if not reads.names:
             raise KeyedError(one.key, "it reads no unknown; set the value in the scene")
+        leaves = _leaves({name: start[name] for name in reads.names})
+        result: Any = dr.sum(_shaped(one, _Reads({**start, **leaves}), info.shape), axis=None)
+        if dr.grad_enabled(result):
+            dr.backward(result)
+            if endless := [name for name, x in leaves.items() if not np.isfinite(arrays.numpy(dr.grad(x))).all()]:
+                raise KeyedError(
+                    one.key,
+                    f"its derivative by {listed(endless)} is not finite at the initial values, as that of a root at 0; start elsewhere",
+                )
         return tuple(reads.names)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender.rendering.mitsuba.scene_graph import all_shapes, class_name
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, all_shapes, class_name
 from unrender.rendering.mitsuba.scene_loading import media
 
 _log = logging.getLogger("unrender")
@@ -73,6 +73,34 @@ def unbounded_notices(scene: Any) -> list[str]:
     return [
         "a medium without a border surrounds the scene, so paths reach the environment by emitter sampling alone: its brightness depends "
         "on sample_emitters and on the phase function, as in Mitsuba; put the medium inside a closed shape with a null BSDF"
+    ]
+
+
+def copied_media_notices(scene: Any, graph: ObjectGraph, keys: Iterable[str]) -> list[str]:
+    """Return one notice for each unknown medium around a sensor, or around a shape, whose description has a medium of its own there, such
+    as a copy, and for each such copy that is unknown, if unknowns change one of the two."""
+    media_of_keys = [
+        (part, key)
+        for key in (keys if graph.of("medium") else ())
+        if key in graph.properties
+        for chain in graph.chains(graph.properties[key][2])
+        for part in chain
+        if isinstance(part, mi.Medium)
+    ]
+    if not media_of_keys:
+        return []
+    unknown, names = dict(reversed(media_of_keys)), dict[str, list[str]]()
+    places = [(f"sensor {x.id()}", x.get_medium(), partial(_rays, x)) for x in scene.sensors()]
+    places += [(f"the outside of {x.id()}", x.exterior_medium(), partial(_outwards, x.bbox())) for x in scene.shapes()]
+    places = [place for place in places if place[1] is not None]
+    around = _surrounding(scene, [rays() for _, _, rays in places])
+    for (name, own, _), other in zip(places, around, strict=True):
+        if other not in (None, own) and (own in unknown) != (other in unknown):
+            names.setdefault(unknown.get(own) or unknown[other], []).append(name)
+    return [
+        f"{key}: {found[0]}{f' and {len(found) - 1} more' if found[1:] else ''} has a second description of the medium that is there, and "
+        "unknowns change only one of the two; describe the medium once, with an id, and refer to it"
+        for key, found in names.items()
     ]
 
 

@@ -17,7 +17,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import poses, turned_lights
-from unrender.rendering.mitsuba.camera_media import unbounded_notices
+from unrender.rendering.mitsuba.camera_media import copied_media_notices, unbounded_notices
 from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.geometry_notices import contact_notices, jump_notices, shadow_notices, specular_notices
@@ -100,6 +100,7 @@ class MitsubaRenderer:
             *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
             *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
             *unbounded_notices(self.pair.current),
+            *copied_media_notices(self.pair.current, self.pair.loaded().graph, keys),
             *contact_notices(self.pair.current, keys),
             *specular_notices(self.pair.current, keys),
             *shadow_notices(self.pair.current, keys),

@@ -345,7 +345,7 @@ def _name(node: Any, holder: str, prop: str, plugin: str, number: int) -> str:
         prop = f"brdf_{number}"
     elif prop.startswith("_"):
         prop = _kind(node).lower()
-    return f"{holder}.{prop}{'_medium' if _kind(node) == 'Medium' else ''}"
+    return f"{holder}.{prop}{'_medium' if prop in ('interior', 'exterior') else ''}"
 
 
 def _kind(node: Any) -> str:
