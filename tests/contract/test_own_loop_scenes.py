@@ -117,7 +117,12 @@ def test_parameters_of_dr_jit_that_are_not_finite_are_one_line(bad: float) -> No
             ur.Renderer(surface, [TEXTURE], spp=1)({TEXTURE: one})
 
 
-def test_a_scene_of_another_variant_is_refused() -> None:
+def test_a_scene_of_another_variant_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A problem that is used after another `ur.use` was a traceback."""
+    problem: Any = ur.Problem(surface, [ur.Parameter(TEXTURE, initial=0.5)], [ur.View(REFERENCE)])
+    monkeypatch.setattr(problem.renderer.pair.loaded(), "variant", "llvm_ad_spectral")
+    with pytest.raises(InputError, match=r"scene: it was loaded under llvm_ad_spectral, and .*; call unrender\.use\("):
+        ur.optimize(problem, "plain", steps=1, progress=False)
     Foreign = type("Scene", (), {"__module__": "mitsuba.scalar_rgb"})
     with pytest.raises(InputError, match="loaded under another variant than"):
         ur.Renderer(Foreign(), KEYS)

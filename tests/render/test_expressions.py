@@ -17,6 +17,7 @@ from unrender.core import arrays
 from unrender.core.errors import InputError, KeyedError
 from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.methods import method
 from unrender.rendering.expression_texts import parse
 from unrender.rendering.expressions import ExpressionRenderer
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -302,13 +303,23 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"expression": "strength[1]"}, r"strength\[1\] is not there: strength has 1 row, the first is strength\[0\]"),
         ({"expression": "sinh(strength)"}, r"'sinh\(strength\)' is not allowed; there are numbers, .*, tanh"),
         ({"expression": "strength +"}, r"it is no expression"),
-        ({"expression": "-strength"}, r"outside of the range"),
+        ({"expression": "-strength"}, r"intensity.value: expected at least 0, got -1 to -1 at the initial"),
         ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),
         ({"expression": "sqrt(strength - 1)"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.5"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "strength * [1, 2]"}, r"has the shape \(2,\), lamp.intensity.value has \(3,\)"),
         ({"key": "lamp.colour"}, r"the scene has no parameter lamp.colour"),
         ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs an initial value"),
+        ({"initial": "initial = []"}, r"needs an initial value: a number"),
+        ({"initial": 'initial = "nix.npy"'}, r"parameters\[0\].key: initial: .*nix.npy: no such file"),
+        (
+            {"initial": 'initial = 1.0\n[[parameters]]\nkey = "lamp.intensity.value"'},
+            r"parameters\[1\].key: lamp.intensity.value has an expression, which sets it; leave out one of them",
+        ),
+        (
+            {"initial": 'initial = 1.0\n[[parameters]]\nkeys = ["lamp.intensity.value"]'},
+            r"parameters\[1\].keys: lamp.intensity.value has an expression",
+        ),
     ],
 )
 def test_an_expression_that_cannot_be_is_refused_in_one_line(
@@ -317,6 +328,30 @@ def test_an_expression_that_cannot_be_is_refused_in_one_line(
     with pytest.raises(InputError, match=message) as caught:
         ur.Problem.from_file(file(tmp_path, **change))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("expressions", "message"),
+    [
+        ([LEFT], "expressions: expected texts or functions by key of the scene, got "),
+        ({LEFT: lambda _: None}, "expression of left.intensity.value: the function returned None, expected a Dr.Jit"),
+        ({LEFT: lambda _: "strength"}, "the function returned 'strength', expected a Dr.Jit tensor"),
+    ],
+)
+def test_what_is_no_function_of_tensors_is_refused_in_one_line(expressions: Any, message: str) -> None:
+    """A text as the result did not end."""
+    with pytest.raises(InputError, match=message):
+        problem(picture(), expressions, ur.Parameter("strength", initial=1.0))
+
+
+@pytest.mark.parametrize("loses", [dr.detach, lambda x: mi.TensorXf(x.numpy())])
+def test_a_function_that_loses_its_derivative_has_no_path_gradient(loses: Any) -> None:
+    """The run ended at its start as "finished". Perturbed renders need no derivative."""
+    expressions = {LEFT: lambda values: loses(values["strength"]) * mi.TensorXf([1, 0.8, 0.6])}
+    made = problem(picture(), expressions, ur.Parameter("strength", initial=1.0))
+    with pytest.raises(InputError, match=r"by path gradients, since the function of left\.intensity\.value loses its"):
+        ur.optimize(made, "plain", steps=1, progress=False)
+    assert "perturbed renders" in method("auto").plan(made).lines[0]
 
 
 def test_an_unknown_that_nothing_reads_is_refused() -> None:

@@ -246,7 +246,13 @@ def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
             'with = { "wall.bsdf.reflectance.value" = 0.5 }',
             r"wall.bsdf.reflectance.value is known in all views, so none",
         ),
-        ("with = 3", r"problem.toml:6: views\[0\].with: expected a table of values by key"),
+        ("with = 3", r"problem.toml:6: views\[0\].with: expected a table of values by key in quotes"),
+        ("with = { lamp.intensity.value = 0 }", r'"lamp.intensity.value" = 0 }, got lamp = \{\'intensity\''),
+        ('with = { "lamp.intensity.value" = true }', r"got lamp.intensity.value = true$"),
+        (
+            'with = { "wall.rotation" = [0, 1] }',
+            r"wall.rotation: expected a number or 3 numbers, got an array of shape",
+        ),
         ('with = { "lamp.intensity.value" = -1 }', r"views\[0\].with: lamp.intensity.value: expected at least 0"),
         ('with = { "lamp.intensity.value" = [1, 2] }', r"views\[0\].with: lamp.intensity.value: "),
         ('scene = "missing.xml"', r"views\[0\].scene: "),
@@ -338,6 +344,11 @@ def test_reopened_scenes_of_views_keep_the_depth_of_their_integrators(tmp_path: 
     for each in (made, made.replaced(name="again"), reopened, staged, sent):
         assert ur.render(each, view=0, spp=4).mean() > 0.01
         assert not ur.render(each, view=1, spp=4).any()
+
+
+def test_a_known_value_without_a_key_is_refused() -> None:
+    with pytest.raises(InputError, match=r"view 1: known: expected values by key of the scene, got \{3: 0\.5\}"):
+        problem([ur.View(picture()), ur.View(picture(), known={3: 0.5})])  # pyright: ignore[reportArgumentType]
 
 
 def test_a_scene_without_the_unknowns_is_refused() -> None:

@@ -280,11 +280,13 @@ def test_every_derivative_of_an_estimate_has_the_priors_part() -> None:
         ({"smoothness": 0.1}, "need a texture, a volume or vertices"),
         ({"smooth": 0.1}, "smooth"),
         (3.0, "expected a table such as"),
+        ({"near": 5, "std": 0.5}, "near: expected at least 0 and at most 1 as the unknown's bounds, got 5"),
+        ({"palette": [[128.0, 0.2, 0.1]], "std": 0.5}, "palette: expected at least 0 and at most 1 as the unknown's"),
     ],
 )
 def test_a_prior_that_does_not_suit_is_refused_in_one_line(prior: Any, message: str) -> None:
     with pytest.raises(InputError, match=r"parameter x: prior") as caught:
-        linear(prior)
+        linear(prior, bounds=(0.0, 1.0))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

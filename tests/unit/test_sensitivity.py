@@ -12,6 +12,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.runs import image_sensitivity as module
 from unrender.runs.image_sensitivity import insensitive, sensitivity
+from unrender.runs.map_uncertainty import uncertainty
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -89,9 +90,28 @@ def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):
     assert len(counts) == 2
 
 
-def test_refuses_what_makes_no_sense():
-    with pytest.raises(InputError, match="probes"):
-        sensitivity(problem(), probes=0)
-    with pytest.raises(InputError, match="expected shape"):
-        sensitivity(problem(), {"wall": np.zeros((2, 2, 2))})
+@pytest.mark.parametrize(
+    ("function", "given", "message"),
+    [
+        *(
+            (function, given, message)
+            for function in (sensitivity, uncertainty)
+            for given, message in (
+                ({"problem": "wall"}, "expected a Problem, such as that of Problem.from_file, got 'wall'"),
+                ({"values": "out"}, "parameters: expected values by key of the problem's unknowns, got 'out'"),
+                ({"values": {"wall": np.zeros((2, 2, 2))}}, "parameter wall: expected shape"),
+                ({"seconds": "long"}, "seconds must be a number, got 'long'"),
+                ({"seed": "first"}, "seed: expected a whole number"),
+            )
+        ),
+        (sensitivity, {"probes": 0}, "probes must be a whole number of at least 1"),
+        (sensitivity, {"views": 0}, "views must be a whole number of at least 1, got 0"),
+        (uncertainty, {"values": None}, r"parameters: expected \['wall'\], got \[\]"),
+        (uncertainty, {"values": {"wall": np.full(TEXTURE, np.nan)}}, "expected finite values of the unknowns"),
+    ],
+)
+def test_refuses_what_makes_no_sense(function: Any, given: dict[str, Any], message: str):
+    """Most were tracebacks. Of values that are not finite it was said that no picture depends on them."""
+    with pytest.raises(InputError, match=message):
+        function(**({"problem": problem(), "values": {"wall": np.full(TEXTURE, 0.5)}} | given))
     assert ur.runs.sensitivity is sensitivity

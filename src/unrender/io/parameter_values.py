@@ -187,7 +187,7 @@ def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str
     if not shape:
         return "a number"
     if shape == (3,):
-        return "a number or a colour (3 numbers)"
+        return "a number or 3 numbers"
     colour = "a colour (3 numbers), " if len(shape) > 1 and shape[-1] == 3 else ""
     return f"a number, {colour}or an array of shape {conversion.picture_shape(shape)}"
 

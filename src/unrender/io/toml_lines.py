@@ -223,12 +223,13 @@ def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tupl
         InputError: the file is missing, or "problem.toml:12: parameters[0].bounds: expected ..., got ...".
     """
     text = bounded_files.read_text(file, LARGEST).replace("\r\n", "\n")
+    content = parse(text, str(file))
     try:
-        return model.model_validate(parse(text, str(file))), text
+        return model.model_validate(content), text
     except pydantic.ValidationError as error:
         # Report an unknown field first: if a name is misspelt, the correct one is missing too.
         details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
-        raise error_at(file, text, *_explain(details[0], model, tables)) from error
+        raise error_at(file, text, *_explain(details[0], content, model, tables)) from error
 
 
 def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
@@ -236,8 +237,9 @@ def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
     return InputError(f"{file}:{find(text, place)}: {dotted(place)}: {what}")
 
 
-def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]]) -> tuple[Place, str]:
-    """Return the place and message of one of pydantic's errors, without pydantic's additions for unions and tuples."""
+def _explain(detail: Any, content: Any, model: type[Table], tables: Mapping[str, type[Table]]) -> tuple[Place, str]:
+    """Return the place and message of one of pydantic's errors about the content of a file, without pydantic's additions for unions and
+    tuples."""
     location = detail["loc"]
     place: Place = location[:1]
     if len(location) >= 2 and location[0] in tables:
@@ -250,7 +252,11 @@ def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]])
     expected = fields[name].description if name in fields else "a table"
     if detail["type"] == "missing" and len(location) == len(place):
         return place, f"missing, expected {expected}"
-    got = repr(detail["input"])
+    for part in place:
+        content = content[part]
+    entry = location[len(place)] if len(location) > len(place) and isinstance(content, dict) else None
+    got = str(detail["input"]).lower() if isinstance(detail["input"], bool) else repr(detail["input"])
+    got = f"{entry} = {got}" if isinstance(content, dict) and entry in content else got
     return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.text import did_you_mean, listed
@@ -91,6 +91,16 @@ class ExpressionRenderer(RendererWrapper):
             raise InputError(f"{unread}: neither a parameter of the scene nor read by an expression")
         targets = {name: [key for key, names in self.reads.items() if name in names] for name in self.unknowns}
         infos = {name: _info(self.unknowns[name].shape, [known[key] for key in keys]) for name, keys in targets.items()}
+        lost: dict[str, str] = {}
+        for name, keys in targets.items():
+            reads = _Reads({**start, **_leaves({name: start[name]})})
+            results = _evaluated(self.expressions, keys, reads, known)
+            if without := [key for key, x in results.items() if not dr.grad_enabled(x)]:
+                lost[name] = without[0]
+        for name, key in lost.items():
+            reason = f"the function of {key} loses its derivative; compute with the Dr.Jit tensors that it gets"
+            infos[name] = replace(infos[name], differentiable=False, reason=reason)
+        self._lost = frozenset(lost)
         taken = set(self.reads)
         self._info = {**{key: info for key, info in known.items() if key not in taken}, **infos}
         self._targets = targets
@@ -107,6 +117,9 @@ class ExpressionRenderer(RendererWrapper):
 
     def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable = differentiated(keys, derivatives)
+        if lost := next((key for key in keys if key in differentiable & self._lost), None):
+            reason = self._info[lost].reason
+            raise InputError(f"parameter {lost}: it cannot be recovered by path gradients, since {reason}")
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
         return _ExpressionSession(self, inner, differentiable)
 
@@ -120,9 +133,8 @@ class ExpressionRenderer(RendererWrapper):
     def evaluated(self, values: Mapping[str, Any]) -> Tree:
         """Return the scene's parameters that depend on any of `values`; unknowns that are not among these have their initial values."""
         missing = {name: self.array(x) for name, x in self.unknowns.items() if name not in values}
-        reads, shapes = _Reads({**missing, **values}), self.inner.parameters()
         needed = {key for name in values if name in self.unknowns for key in self._targets[name]}
-        return {one.key: _shaped(one, reads, shapes[one.key].shape) for one in self.expressions if one.key in needed}
+        return _evaluated(self.expressions, needed, _Reads({**missing, **values}), self.inner.parameters())
 
     def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return {key of the scene: value} for values of unknowns and of the scene's parameters."""
@@ -151,8 +163,9 @@ class ExpressionRenderer(RendererWrapper):
         if not np.isfinite(value).all():
             raise KeyedError(one.key, "it is not finite at the initial values")
         if not arrays.all_within(value, info.lowest, info.highest):
+            limits = " and ".join(checks.limits(info.lowest, info.highest))
             raise KeyedError(
-                one.key, f"at the initial values it is outside of the range {info.lowest} to {info.highest}"
+                one.key, f"expected {limits}, got {value.min():g} to {value.max():g} at the initial values"
             )
         if not reads.names:
             raise KeyedError(one.key, "it reads no unknown; set the value in the scene")
@@ -192,9 +205,11 @@ def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknown
         try:
             loaded = bounded_files.read_array(Path(value)) if isinstance(value, (str, Path)) else value
             starts[name] = np.atleast_1d(np.asarray(loaded, np.float32))
+        except InputError as error:
+            raise InputError(f"{name}: initial: {error}") from error
         except (TypeError, ValueError):
             starts[name] = np.full(1, np.nan, np.float32)
-        if value is None or not np.isfinite(starts[name]).all():
+        if value is None or not starts[name].size or not np.isfinite(starts[name]).all():
             raise InputError(
                 f"{name}: an unknown of expressions needs an initial value: a number, or a list or array of these"
             )
@@ -220,10 +235,19 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
     return replace(ParameterInfo(shape, **combined(targets)), nonlinear=nonlinear, of_expression=True)
 
 
+def _evaluated(
+    expressions: Iterable[Expression], keys: Collection[str], reads: _Reads, known: Mapping[str, ParameterInfo]
+) -> Tree:
+    """Return the values of the expressions of these keys."""
+    return {one.key: _shaped(one, reads, known[one.key].shape) for one in expressions if one.key in keys}
+
+
 def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
     """Return the value of an expression, of the parameter's shape and of the kind of the unknowns' arrays."""
     like = values.like
     result = one.function(values)
+    if result is None or isinstance(result, str):
+        raise KeyedError(one.key, f"the function returned {result!r:.30}, expected a Dr.Jit tensor")
     if not arrays.is_drjit(result) or not dr.is_tensor_v(result):
         result = type(like)(result)
     if tuple(result.shape) == shape:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from unrender.core import arrays, checks, periodic
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.core.random import Key
+from unrender.core.random import Key, check_seed
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
@@ -97,9 +98,21 @@ def sensitivity(
         {key: array} of the parameters' shapes, float32, for the parameters with path gradients.
 
     Raises:
-        InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` is below 1.
+        InputError: `values` have other keys or shapes than the problem's; `probes`, `spp` or `views` is below 1.
     """
     return curvature(problem, values, probes, spp, seconds, seed, views).sensitivity()
+
+
+def check_arguments(owner: str, problem: Any, values: Any, seconds: Any, seed: Any) -> None:
+    """Raise `InputError` unless these are a problem, finite values of its unknowns or None, a number of seconds, which may be infinite,
+    and a seed."""
+    if not isinstance(problem, Problem):
+        raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {problem!r:.60}")
+    if isinstance(seconds, bool) or not isinstance(seconds, Real) or np.isnan(float(seconds)):
+        raise InputError(f"{owner}: seconds must be a number, got {seconds!r:.60}")
+    check_seed(f"{owner}: seed", seed)
+    if not all(map(arrays.all_finite, as_tree(problem, values).values())):
+        raise InputError(f"{owner}: expected finite values of the unknowns")
 
 
 def curvature(
@@ -118,7 +131,9 @@ def curvature(
     With the `noise` (H, W, 2) of each view, a and b of the root a I + b 11ᵀ of the channels' covariance, the probes are also weighted by
     that root, on the same paths.
     """
-    checks.integer("sensitivity", "probes", probes, at_least=1)
+    check_arguments("sensitivity", problem, values, seconds, seed)
+    for name, number in (("probes", probes), ("views", len(problem.views) if views is None else views)):
+        checks.integer("sensitivity", name, number, at_least=1)
     if spp is None:
         spp = adjoint_spp(problem)
     checks.integer("sensitivity", "spp", spp, at_least=1)

@@ -17,6 +17,7 @@ from unrender.runs.image_sensitivity import (
     FEWEST_PROBES,
     MAP_AXES,
     Curvature,
+    check_arguments,
     curvature,
     map_keys,
     mask_roots,
@@ -29,7 +30,7 @@ from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
 from unrender.runs.verification import OF_FUNCTION, compares, misfit_of_views
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, render, selected_views
+from unrender.scene.render import render, selected_views
 
 _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
@@ -113,10 +114,10 @@ def uncertainty(
         Maps of the textures with path gradients and κ < 1.5, and standard errors of the numbers.
 
     Raises:
-        InputError: `values` have other keys or shapes than the problem's.
+        InputError: `values` have other keys or shapes than the problem's, or are not finite.
     """
     values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
-    as_tree(problem, values)  # refuses other keys and shapes
+    check_arguments("uncertainty", problem, values or {}, seconds, seed)
     known, maps, until = Curvature(), Uncertainty(), time.perf_counter() + seconds
     keys, mapped = checked_keys(problem, values, problem.initial_values()), map_keys(problem)
     if mapped or keys:

@@ -60,7 +60,7 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
             return f"; {why}"
         for near in (owner, *difflib.get_close_matches(owner, owners, n=1)):
             if poses := _poses(near, known):
-                return f"; a pose is {poses} (--method smoothed)"
+                return f"; a pose is {poses}"
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
     similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
@@ -106,7 +106,7 @@ def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
     if rest != _TRANSFORM:
         return ""
     if poses := _poses(owner, known):
-        return f"; its pose can be: {poses} (--method smoothed)"
+        return f"; its pose can be: {poses}"
     return "" if _no_pose(owner, known) else "; a shape in a scene with participating media has no pose"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import checks, periodic, tables
+from unrender.core import arrays, checks, periodic, tables
 from unrender.core.errors import InputError
 from unrender.io import resampling
 from unrender.preconditioners import grid
@@ -17,6 +17,9 @@ from unrender.preconditioners.mesh import MeshTopology
 
 _CORNER = 0.1
 """Size of a difference, in units of `total_variation`, below which its norm is rounded to have a derivative at 0."""
+
+_FAR = 3.0
+"""Standard deviations by which expected values may be outside of an unknown's bounds."""
 
 _ARRAYS = (("near", 1, "a number or one number per channel"), ("palette", 2, "a list of colours"))
 """(field, largest number of axes of an array, what it is)."""
@@ -77,7 +80,12 @@ class Prior:
             )
 
     def on(
-        self, initial: np.ndarray, repeated: int = 0, topology: MeshTopology | None = None, moving: bool = False
+        self,
+        initial: np.ndarray,
+        repeated: int = 0,
+        topology: MeshTopology | None = None,
+        moving: bool = False,
+        bounds: tuple[float | None, float | None] = (None, None),
     ) -> Prior:
         """Return the prior bound to an unknown.
 
@@ -86,15 +94,24 @@ class Prior:
             repeated: Number of columns at each end that repeat those of the other, for an environment map.
             topology: Mesh at whose vertices the unknown has values; None for textures, volumes, colours and numbers.
             moving: Whether the values are the positions of that mesh.
+            bounds: Limits of the values; None is open.
 
         Raises:
-            InputError: A term that does not suit the unknown's shape.
+            InputError: A term that does not suit the unknown's shape, or expected values far outside of the bounds.
         """
         shape = periodic.interior_shape(initial.shape, repeated)
         channels = initial.size // len(topology.places) if topology is not None else _channels(shape)
         inner = periodic.interior(initial, repeated)
         near = None if self.near is None else _values(self.near, inner, channels)
         palette = None if self.palette is None else _palette(self.palette, channels)
+        low, high = (
+            end if end is None else end + sign * _FAR * (self.std or 0.0)
+            for end, sign in zip(bounds, (-1, 1), strict=True)
+        )
+        for name, given, values in (("near", self.near, near), ("palette", self.palette, palette)):
+            if values is not None and not arrays.all_within(values, low, high):
+                within = " and ".join(checks.limits(*bounds))
+                raise InputError(f"prior: {name}: expected {within} as the unknown's bounds, got {given!r:.60}")
         if self.smoothness is not None or self.total_variation is not None:
             if moving:
                 raise InputError("prior: neighbouring positions differ; a mesh has regularizer = { bilaplacian = ... }")

@@ -132,7 +132,7 @@ class Problem(ViewLosses):
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions or {})
+        renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions)
         if not partial:
             check_determined(original_views, members_of(checked_parameters))
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
@@ -328,7 +328,7 @@ def _opened(
     max_depth: int | None,
     parameters: Sequence[Parameter],
     views: Sequence[View],
-    expressions: Mapping[str, Any],
+    expressions: Mapping[str, Any] | None,
 ) -> tuple[Renderer, tuple[View, ...]]:
     """Return the renderer of a scene, with unknowns that photographs have, and the views by its sensors. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
@@ -375,7 +375,15 @@ def open_scene(
     expressions: Mapping[str, Any] | None = None,
 ) -> Renderer:
     """Return the renderer of a scene in which the ties of these parameters are unknowns, and `others` will be used. Raises `FieldError`."""
-    functions = expressions or {}
+    functions = {} if expressions is None else expressions
+    if not (isinstance(functions, Mapping) and all(isinstance(key, str) for key in functions)):
+        raise FieldError(("expressions",), f"expected texts or functions by key of the scene, got {functions!r:.60}")
+    if taken := next((key for key in scene_keys(parameters) if key in functions), None):
+        index = next(n for n, one in enumerate(parameters) if taken == one.key or taken in (one.keys or ()))
+        field = "key" if parameters[index].keys is None else "keys"
+        raise FieldError(
+            ("parameters", index, field), f"{taken} has an expression, which sets it; leave out one of them"
+        )
     renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])
     try:
         own = [p for p in parameters if isinstance(p.key, str) and p.keys is None and p.key not in OF_PHOTOGRAPHS]

@@ -117,6 +117,8 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
     point = problem.initial()
     if parameters is None:
         return point
+    if not isinstance(parameters, Mapping):
+        raise InputError(f"parameters: expected values by key of the problem's unknowns, got {parameters!r:.60}")
     if set(parameters) != set(point):
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
     parameters = problem.full(parameters)

@@ -94,7 +94,7 @@ class _View(Table):
     weight: _Number = Field(1.0, description="a number above 0")
     mask: StrictStr | None = Field(None, description="the path of a picture with values from 0 to 1")
     known: dict[str, _Number | StrictStr | list[Any]] | None = Field(
-        None, alias="with", description='a table of values by key, such as { "lamp.intensity.value" = 0 }'
+        None, alias="with", description='a table of values by key in quotes, such as { "lamp.intensity.value" = 0 }'
     )
     scene: StrictStr | None = Field(None, description="the path of a Mitsuba .xml file")
     aov: StrictStr | None = Field(None, description=f"one of {', '.join(AOVS)}")

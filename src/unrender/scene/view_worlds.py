@@ -25,8 +25,9 @@ from unrender.scene.view_checks import check_sensor
 
 
 def known_keys(views: Sequence[View]) -> list[str]:
-    """Return the keys for which at least one view has its own value."""
-    return list(dict.fromkeys(key for view in views if isinstance(view.known, Mapping) for key in view.known))
+    """Return the names for which at least one view has its own value."""
+    held = [key for view in views if isinstance(view.known, Mapping) for key in view.known]
+    return list(dict.fromkeys(key for key in held if isinstance(key, str)))
 
 
 def of_views(
@@ -37,6 +38,10 @@ def of_views(
     `opened` is the function from a scene to its renderer; called once for equal scenes. Raises `FieldError` if a sensor, key or value is
     invalid, or a scene has none of the unknown keys.
     """
+    for index, view in enumerate(views):
+        if isinstance(view.known, Mapping) and not all(isinstance(key, str) for key in view.known):
+            what = f"expected values by key of the scene, got {view.known!r:.60}"
+            raise FieldError(("views", index, "with"), what, f"view {index}: known")
     renderer, sensors = _turned(renderer, views, keys)
     if sensors:
         return renderer, tuple(

@@ -172,6 +172,8 @@ class MitsubaRenderer:
 
         Poses and other parameters that move geometry cannot be prepared together, since the scenes of posed shapes are not rebuilt.
         """
+        if (own := self.pair.loaded().variant) != mi.variant():
+            raise InputError(f"scene: it was loaded under {own}, and {mi.variant()} is set; call unrender.use({own!r})")
         names, differentiable = tuple(keys), differentiated(keys, derivatives)
         if (names, differentiable, space) not in self._checked:
             for key in keys:
