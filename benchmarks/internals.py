@@ -108,7 +108,7 @@ def _mitsuba(problem: ur.Problem) -> Any:
 
 def from_tensor(value: Any, like: Any) -> Any:
     """A tensor in the type that a scene's parameter has."""
-    from unrender.rendering.mitsuba.tensors import from_tensor as convert
+    from unrender.rendering.mitsuba.parameters import from_tensor as convert
 
     # A product, since the derivative of `dr.unravel` overwrites those that its argument has from elsewhere.
     return convert(value * 1.0, like)

@@ -53,8 +53,7 @@ class Parameterisation(Protocol):
         ...
 
 
-_LARGEST = 80.0
-"""Magnitude at which u is clamped in exponentials: e^88 is the limit of single precision."""
+_LARGEST = 80.0  # magnitude at which u is clamped in exponentials: e^88 is the limit of single precision
 
 
 @register(position=0)

@@ -14,9 +14,9 @@ import unrender as ur
 from kernels import recorded
 from tiers import quick
 from unrender.rendering.mitsuba import mesh_layout
+from unrender.rendering.mitsuba.parameters import from_tensor, to_tensor
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.renderer import SampleRequest, Space
 
 

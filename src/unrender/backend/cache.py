@@ -22,8 +22,7 @@ REFERENCES, KERNELS = "references", "kernels"
 LARGEST = {REFERENCES: 1 << 29, KERNELS: 1 << 30}
 """Maximum size of each part in bytes."""
 
-_DRJIT_VARIABLE = "DRJIT_CACHE_DIR"
-"""Dr.Jit's folder of compiled kernels. Dr.Jit reads the variable once, on import."""
+_DRJIT_VARIABLE = "DRJIT_CACHE_DIR"  # Dr.Jit's folder of compiled kernels. Dr.Jit reads the variable once, on import.
 _STAMP = ".tidied"
 _DAY = 86400.0
 
@@ -86,10 +85,7 @@ def use_for_kernels() -> None:
 
 
 def kernels_changed() -> int | None:
-    """Return the time of the last change of Dr.Jit's cache folder: a kernel was added or removed.
-
-    The unit is nanoseconds of the file system's clock; None if unknown.
-    """
+    """Return the time in nanoseconds at which Dr.Jit last added or removed a kernel in its cache folder; None if unknown."""
     place = os.environ.get(_DRJIT_VARIABLE) or os.path.expanduser("~/.drjit")
     try:
         return os.stat(place).st_mtime_ns

@@ -11,8 +11,7 @@ from pathlib import Path
 
 _GROUPS, _MOUNT, _MEMORY = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"), Path("/proc/meminfo")
 _STATUS = Path("/proc/self/status")
-_UNLIMITED = 1 << 60
-"""Smallest value that version 1 of control groups uses for "no limit", in bytes."""
+_UNLIMITED = 1 << 60  # smallest value that version 1 of control groups uses for "no limit", in bytes
 
 
 def cores() -> int:

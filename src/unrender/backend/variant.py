@@ -27,15 +27,11 @@ VARIANTS = (CUDA, LLVM, "cuda_ad_spectral", "llvm_ad_spectral")
 """Supported variants: RGB or spectral, differentiable, unpolarised."""
 _EXPECTED = f"expected 'auto', {', '.join(map(repr, VARIANTS[:-1]))} or {VARIANTS[-1]!r}"
 
-_INITIALISATION = 0.5
-"""Maximum time in seconds that Dr.Jit takes to reject a library."""
-
-_THREADS = 4
-"""Maximum number of threads per core."""
+_INITIALISATION = 0.5  # maximum time in seconds that Dr.Jit takes to reject a library
+_THREADS = 4  # maximum number of threads per core
 
 _threads_limited = False
-_setting = threading.RLock()
-"""Lock: Mitsuba's module attributes are incomplete while another thread sets the variant."""
+_setting = threading.RLock()  # Mitsuba's module attributes are incomplete while another thread sets the variant
 
 _TRIAL = """
 import os, sys
@@ -205,10 +201,7 @@ def use_threads(count: int) -> None:
 
 @contextlib.contextmanager
 def two_threads() -> Iterator[None]:
-    """Give Dr.Jit at least two threads within this context.
-
-    With one thread, Mitsuba's OpenEXR deadlocks when it reads or writes a file.
-    """
+    """Give Dr.Jit at least two threads within this context: with one, Mitsuba's OpenEXR deadlocks on files."""
     ensure()
     import drjit as dr
 

@@ -36,10 +36,7 @@ Several = Annotated[int, 2]
 def number(
     owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False
 ) -> float:
-    """Return `value` as a finite float in (above, below), or in [above, below) with `inclusive`.
-
-    Raises `InputError` that names `owner` (the class or section) and `name` (the argument or field).
-    """
+    """Return a finite float in (above, below), or in [above, below) with `inclusive`. Raises `InputError` that names `owner` and `name`."""
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if math.isfinite(number) and (above < number < below or (inclusive and number == above)):
         return number
@@ -120,10 +117,7 @@ def _checked(kind: type) -> list[tuple[str, Callable[..., Any], tuple[Any, ...],
 
 
 def encode_text(text: str, where: str) -> bytes:
-    """Return the text as UTF-8.
-
-    Raises `InputError` for text with lone surrogates. Python reads file names that are not UTF-8 as such text.
-    """
+    """Return UTF-8. Raises `InputError` for lone surrogates, as in file names that are not UTF-8."""
     try:
         return text.encode()
     except UnicodeEncodeError as error:

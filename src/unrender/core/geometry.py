@@ -9,8 +9,7 @@ import numpy as np
 _OF_SIZE, _OF_COORDINATE, _OF_NEIGHBOURS = 1e-6, 1.5e-7, 0.01
 """Largest distance of coincident points: parts of the size and of the largest coordinate, which are rounding errors in single precision,
 and of the usual distance of neighbours, which details are not below."""
-_SAMPLE = 4096
-"""Number of points whose neighbours are looked at."""
+_SAMPLE = 4096  # number of points whose neighbours are looked at
 
 
 def weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

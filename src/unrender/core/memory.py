@@ -117,10 +117,7 @@ def _flatten(parts: Iterable[Any]) -> list[Array]:
 
 @functools.cache
 def _members(kind: type) -> tuple[str, ...]:
-    """Return the names of a dataclass's fields, or what else values of a type contain; () for nothing.
-
-    It is looked up once for each type, since a step flattens hundreds of values.
-    """
+    """Return the names of a dataclass's fields, or what values of a type contain; () for nothing. Looked up once for each type."""
     if dr.is_array_v(kind):
         return _ARRAY
     if issubclass(kind, Mapping):

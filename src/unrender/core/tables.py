@@ -24,8 +24,7 @@ from unrender.core.registry import GROUP
 from unrender.core.text import did_you_mean
 
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
-_NEXT = "then"
-"""Name of the field for the component after the word "then"."""
+_NEXT = "then"  # name of the field for the component after the word "then"
 
 
 def parse(text: str, kind: str) -> Any:
@@ -73,8 +72,7 @@ def _number(text: str, kind: str) -> int | float:
 
 
 _TYPE, _NONE = "type", "none"
-_IN_SHORT = ("parameterisation", "schedule")
-"""Kinds that have a short text form, "name(number, ...)" (`core.tables`)."""
+_IN_SHORT = ("parameterisation", "schedule")  # kinds that have a short text form, "name(number, ...)" (`core.tables`)
 _DEEPEST = 16
 _LONGEST_LIST = 4096
 _T = TypeVar("_T")

@@ -14,8 +14,7 @@ from typing import Any
 
 LONGEST_LINE = 1000
 """Largest number of characters of a message."""
-_NAMED = 4
-"""Number of names to list from a list of more than twice that length."""
+_NAMED = 4  # number of names to list from a list of more than twice that length
 
 
 def visible(text: str, keep: str = "") -> str:
@@ -60,10 +59,7 @@ def one_line(text: str) -> str:
 
 
 def reason_of(error: BaseException, longest: int | None = None) -> str:
-    """Return an error's message on one line, or the name of its type if it is empty.
-
-    A message of more than `longest` characters is cut; None means no limit.
-    """
+    """Return an error's message on one line, cut after `longest` characters, or the name of its type if it is empty."""
     return " ".join(str(error).split())[:longest] or type(error).__name__
 
 

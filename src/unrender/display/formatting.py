@@ -99,10 +99,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def with_standard_error(value: float, error: float) -> str:
-    """Format a measured value, which may be negative, with its standard error: 0.0018 ± 0.0019.
-
-    Without a finite error above a millionth of the value, which is rounding, the value stands alone.
-    """
+    """Format a value, which may be negative, with its standard error, if that is finite and no rounding: 0.0018 ± 0.0019."""
     if not (math.isfinite(value) and math.isfinite(error)) or error <= 1e-6 * abs(value):
         return number(value)
     places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error

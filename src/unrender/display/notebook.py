@@ -26,7 +26,6 @@ def block(title: str, *parts: str) -> str:
 
 
 def lines(texts: Sequence[str], prefix: str = "") -> str:
-    """Return one line of HTML per text."""
     return "".join(f"<div>{escape(prefix + text)}</div>" for text in texts)
 
 

@@ -18,10 +18,7 @@ def quantized(colours: np.ndarray) -> np.ndarray:
 
 
 def png(picture: Any, effort: int = 6) -> bytes:
-    """Encode a picture as a PNG file: values in [0, 1] or bytes, (H, W) or (H, W, 3 | 4), or an image of Pillow.
-
-    `effort` is the compression level, 0 to 9.
-    """
+    """Encode values in [0, 1] or bytes, (H, W) or (H, W, 3 | 4), or an image of Pillow, as PNG. `effort` is the compression, 0 to 9."""
     from PIL import Image
 
     if isinstance(picture, np.ndarray):
@@ -36,8 +33,7 @@ def data_uri(colours: Any) -> str:
     return f"data:image/png;base64,{base64.b64encode(png(colours)).decode('ascii')}"
 
 
-_LARGEST = 320
-"""Limit of the sides of a picture in a notebook."""
+_LARGEST = 320  # limit of the sides of a picture in a notebook
 
 
 def shown_image(linear: np.ndarray, like: np.ndarray | None = None) -> np.ndarray:

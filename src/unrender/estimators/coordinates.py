@@ -176,8 +176,7 @@ def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:
 
 _ALONE = 0.1
 """Size of the perturbations of elements that stay at a bound, relative to those that are smoothed: enough for the sign of a gradient."""
-_PROBES = 4
-"""Number of samples that estimate the gain of S for white noise, within 5 percent for a thousand vertices."""
+_PROBES = 4  # number of samples that estimate the gain of S for white noise, within 5 percent for a thousand vertices
 
 
 class PreconditionedPerturbations:

@@ -13,10 +13,8 @@ from unrender.statistics import scores
 
 MOST_AVERAGED = 1 << 19
 """Largest number of pixels, times elements for derivative images, of images that are averaged over steps. Both halves take 12 MiB."""
-_RESIDUAL_ERRORS = 2.0
-"""Standard errors of the sum of squared residuals from which on references have noise."""
-_VALUES = 1 << 22
-"""Maximum number of image values that are converted to double precision at once."""
+_RESIDUAL_ERRORS = 2.0  # standard errors of the sum of squared residuals from which on references have noise
+_VALUES = 1 << 22  # maximum number of image values that are converted to double precision at once
 _MEMORY, _CHANNEL_MEMORY = 0.3, 0.1
 """Weight of the latest image in the running mean of the variance of a pixel, and of one of its channels, which has more noise itself."""
 _MOST_NOISE = 0.1
@@ -24,8 +22,7 @@ _MOST_NOISE = 0.1
 0.092, without it 0.112."""
 _LAUNCH = 1 << 13
 """Time of starting a render, in that of paths: 4,000 to 19,000 on two cores, for four scenes of `suite.numbers`."""
-_GROWTH = 1.0
-"""Weights of derivative images in their mean grow as this power of their number."""
+_GROWTH = 1.0  # weights of derivative images in their mean grow as this power of their number
 
 
 @dataclass(frozen=True)
@@ -82,10 +79,7 @@ class HalvesMean:
         return bool(np.isfinite(self.one).all() and np.isfinite(self.other).all())
 
     def and_one(self, new: HalvesMean, moved: float) -> HalvesMean:
-        """Return the mean with one more image, after a step of length `moved` in units of the differences' widths.
-
-        Images that are not finite are left out.
-        """
+        """Return the mean with one more image, if it is finite, after a step of length `moved` in units of the differences' widths."""
         if not new.is_finite():
             return self
         if not self.is_finite():
@@ -108,7 +102,6 @@ class HalvesMean:
         return float((one * other).sum()), float(np.square(terms).sum())
 
     def plus(self, change: np.ndarray) -> HalvesMean:
-        """Return the mean with a change of both halves."""
         return replace(self, one=(self.one + change).astype(np.float32), other=(self.other + change).astype(np.float32))
 
 
@@ -144,10 +137,7 @@ class Products:
 
 
 def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
-    """Return the weight 1 / (1 + σ² / (c m)) of each pixel or channel, with c = `limit` and the median m of the variances σ² above 0.
-
-    It is 1 if no pixel has noise.
-    """
+    """Return the weight 1 / (1 + σ² / (c m)) of each pixel or channel, c = `limit`, m the median variance above 0; 1 without noise."""
     noisy = variance[variance > 0.0]
     return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
 

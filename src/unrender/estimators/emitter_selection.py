@@ -25,11 +25,8 @@ EmitterSelection = Literal["scene", "adaptive"]
 _FIRST, _REFRESH = 4, 20
 """Number of initial steps that all update the probabilities, and interval of later updates in steps."""
 
-_MEMORY = 0.8
-"""Decay of earlier statistics at each update."""
-
-_LEAST_VARIANCE = 0.1
-"""Floor of a pixel's variance in divisions, relative to the mean over all pixels."""
+_MEMORY = 0.8  # decay of earlier statistics at each update
+_LEAST_VARIANCE = 0.1  # floor of a pixel's variance in divisions, relative to the mean over all pixels
 
 
 @dataclass(frozen=True)
@@ -92,10 +89,7 @@ class EmitterState:
 
 
 def init(owner: str, session: RenderSession) -> EmitterState | None:
-    """Return the state before the first step; None if the scene has at most one emitter.
-
-    Raises `InputError` if the renderer does not support custom emitter sampling.
-    """
+    """Return the first state; None for at most one emitter. Raises `InputError` without support for custom emitter sampling."""
     try:
         start = drawing_emitters(session).emitters()
     except InputError as error:
@@ -129,8 +123,6 @@ def connections(
 
     Args:
         session: session of the frame's paths.
-        parameters: parameters of the paths.
-        tangents: random tangents.
         image: image of at least two groups.
         weights: weights of the adjoint, the loss derivative at the image of the other groups, (groups, ...).
         spp: S.
@@ -177,10 +169,8 @@ def _observed(evidence: ShareEvidence, y: np.ndarray, squares: np.ndarray, densi
 
 
 def observed(problem: Problem, state: EmitterState, gradient: Tree) -> EmitterState:
-    """Return the state after a step with this gradient with respect to u (`Problem.coordinates`), before preconditioning.
-
-    Variances are relative to the gradient's mean squares, as in Adam's steps.
-    """
+    """Return the state after a gradient with respect to u, before preconditioning. Variances are relative to its mean squares, as in
+    Adam."""
     return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
 

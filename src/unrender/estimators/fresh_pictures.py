@@ -22,10 +22,8 @@ from unrender.scene.render import power_of_two, view_request
 from unrender.statistics import paired_losses
 from unrender.statistics.paired_losses import DISTANCE
 
-_GROUPS = 4
-"""Number of independent groups of each new image."""
-_LEAST_PATHS, _MOST_PATHS = 1 << 12, 1 << 22
-"""Limits of the paths of a new image."""
+_GROUPS = 4  # number of independent groups of each new image
+_LEAST_PATHS, _MOST_PATHS = 1 << 12, 1 << 22  # limits of the paths of a new image
 _LONGER = 2
 """Ratio of the allowed paths to the minimum below which an image has the minimum, because another number of pixels needs another
 recording."""
@@ -34,8 +32,7 @@ _FEW_PIXELS, _FEW_OF_VIEWS = 1 << 10, 1 << 12
 _TOGETHER, _FEWER = 16, 4
 """Number of states that share a launch in `FreshPictures.images_of`, since one number needs one recording; ratio of the samples of one
 image to those of each state, since places differ much."""
-_STREAM = 2
-"""Stream of the run's key for new images; the steps use 0, the warm-up 1."""
+_STREAM = 2  # stream of the run's key for new images; the steps use 0, the warm-up 1
 _MOST_NON_FINITE = 0.01
 """Fraction of pixels that may become non-finite, compared to the start, before an image counts as non-finite."""
 

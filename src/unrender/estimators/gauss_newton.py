@@ -42,12 +42,9 @@ _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
 _BLIND = 0.3
 """Width up to which it grows while differences change no picture, relative to the parameter, or in its units if it is 0."""
-_SETTLED = 0.5
-"""Maximum step, in units of the widths, after which the shift is halved."""
-_DRIFT = 0.25
-"""Distance, in units of the widths, from which on mean derivative images are of another point."""
-_NARROWER = 0.7
-"""Ratio of a width to the one with which mean derivative images began, below which they begin anew."""
+_SETTLED = 0.5  # maximum step, in units of the widths, after which the shift is halved
+_DRIFT = 0.25  # distance, in units of the widths, from which on mean derivative images are of another point
+_NARROWER = 0.7  # ratio of a width to the one with which mean derivative images began, below which they begin anew
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,8 @@ from unrender.statistics.scores import positive_inverse
 if TYPE_CHECKING:
     from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 
-_OF_RANGE = 0.125
-"""Largest width relative to the range between a parameter's bounds."""
-_IMAGE = 2
-"""Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
+_OF_RANGE = 0.125  # largest width relative to the range between a parameter's bounds
+_IMAGE = 2  # Stream of a view's key for the image. Lower streams are for the two halves of the derivative images.
 
 
 @dataclass

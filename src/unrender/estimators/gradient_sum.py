@@ -12,8 +12,7 @@ from unrender.core import arrays, memory
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
-_SIDE = 9
-"""Side of the square of pixels over which variances are averaged, twice."""
+_SIDE = 9  # side of the square of pixels over which variances are averaged, twice
 
 
 def damping(residual: Array, variance: Array, tolerance: float) -> Array:

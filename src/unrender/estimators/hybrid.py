@@ -34,11 +34,8 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, restarted, upsampled
 
-_PERTURBED = 1 << 33
-"""Stream of a step's key for the perturbed renders; path gradients use lower streams."""
-
-_ADJOINTS = 1 << 20
-"""Index of the random numbers of the adjoints of eliminated textures."""
+_PERTURBED = 1 << 33  # stream of a step's key for the perturbed renders; path gradients use lower streams
+_ADJOINTS = 1 << 20  # index of the random numbers of the adjoints of eliminated textures
 
 _MEAN, _SQUARE = 0.9, 0.999
 """Decays of the running means of the perturbed parameters' gradient and of its square, as in Adam."""
@@ -54,7 +51,6 @@ class HybridState:
     """State between steps of both estimators.
 
     Attributes:
-        path: state of the path gradients.
         perturbed: state of the second estimator.
         mean, square: running means of the perturbed parameters' gradient, and of its square, not debiased; {} unless `averaged`.
         step: number of estimates since these began.

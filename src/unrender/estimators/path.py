@@ -25,11 +25,8 @@ from unrender.rendering.renderer import StockRenderer, with_differential_bsdf
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler, upsampled
 
-_EMITTERS = PIXELS + 1
-"""Stream of a step's key for the tangents of emitter sampling."""
-
-_WINDOW = 8
-"""Number of consecutive estimates that have the fresh gradient."""
+_EMITTERS = PIXELS + 1  # stream of a step's key for the tangents of emitter sampling
+_WINDOW = 8  # number of consecutive estimates that have the fresh gradient
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,7 @@ def penalty(problem: Problem, parameters: Mapping[str, Array | np.ndarray]) -> f
 
 
 def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
-    """Return the estimate with priors and regularizers added to the loss and its derivatives; the estimate itself if there are none.
-
-    Second derivatives do not include the regularizers of meshes.
-    """
+    """Return the estimate with priors and regularizers added, in second derivatives without those of meshes; itself without any."""
     if not (keys := _keys(problem)):
         return estimate
     terms = {key: _terms(problem, key, parameters[key]) for key in keys}

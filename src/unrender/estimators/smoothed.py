@@ -41,10 +41,8 @@ from unrender.scene.upsampling import Upsampler
 from unrender.schedules import Schedule
 from unrender.statistics import hessian_updates
 
-_MAX_STORED = 4096
-"""Maximum number of parameters for which a Hessian is stored between steps."""
-_DIRECTIONS = 1
-"""Stream of random numbers for the directions of products; 0 is for the perturbations."""
+_MAX_STORED = 4096  # maximum number of parameters for which a Hessian is stored between steps
+_DIRECTIONS = 1  # stream of random numbers for the directions of products; 0 is for the perturbations
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,11 @@ from unrender.scene.upsampling import Upsampler
 IMAGES = 3
 """Number of images that a step renders of each view."""
 
-_LEAST_GAIN = 0.25
-"""Smallest γ. The first is 1, and the k-th is 1 / k until then."""
-_CHANGE = 0.05
-"""Change of a texture in both directions for the derivative along s, relative to its root mean square."""
+_LEAST_GAIN = 0.25  # Smallest γ. The first is 1, and the k-th is 1 / k until then.
+_CHANGE = 0.05  # change of a texture in both directions for the derivative along s, relative to its root mean square
 _UNSEEN = 1e-3
 """Share of the mean of L that is added to it, since noise dominates the slopes of texels that hardly any pixel sees."""
-_LAST = 3
-"""Index of the random numbers of the derivative along s."""
+_LAST = 3  # index of the random numbers of the derivative along s
 
 
 @dataclass(frozen=True)

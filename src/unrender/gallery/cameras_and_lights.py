@@ -14,8 +14,7 @@ from unrender.scene.parameter import Parameter
 
 _PLACES = {"left": (-1.95, 1.36, 1.95), "middle": (0.15, 1.89, 2.55), "right": (2.18, 1.06, 1.5)}
 _TARGET = (0.0, 0.35, 0.0)
-_TURN, _SHIFT = np.radians(2.0), 0.02
-"""Initial error: an angle, and a distance relative to that of the target."""
+_TURN, _SHIFT = np.radians(2.0), 0.02  # initial error: an angle, and a distance relative to that of the target
 _START = {
     "left": ((0.6, -0.5, 0.62), (-0.5, 0.8, 0.33)),
     "middle": ((-0.8, 0.3, 0.52), (0.4, 0.6, -0.69)),

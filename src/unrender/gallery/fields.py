@@ -12,8 +12,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.losses import L2, Loss
 
-_LONGEST_SIDE = 1 << 13
-"""Pixels along a side of an image with the largest number of values that is read from a file."""
+_LONGEST_SIDE = 1 << 13  # pixels along a side of an image with the largest number of values that is read from a file
 
 
 @dataclass(frozen=True)
@@ -104,10 +103,7 @@ def of(specification: type) -> list[Option]:
 
 
 def fill(name: str, specification: type, options: Mapping[str, Any]) -> Any:
-    """Return the specification with these options, and defaults for the others.
-
-    Raises `InputError` for an unknown option (with the nearest known one), or one out of range.
-    """
+    """Return the specification with these options and other defaults. Raises `InputError` for one that is unknown or out of range."""
     fields = _fields(specification)
     owner = f"gallery problem {name}"
     taken = {}

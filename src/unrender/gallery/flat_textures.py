@@ -20,8 +20,7 @@ from unrender.gallery import fields, meshes, parts
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-_RADIUS, _HEIGHT = 0.34, 0.85
-"""Radius of the balls of `caustic`, and height of their centres above the floor."""
+_RADIUS, _HEIGHT = 0.34, 0.85  # radius of the balls of `caustic`, and height of their centres above the floor
 
 _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75, 0.9, 1.0))}
 """x and z of their centres, and tint."""

@@ -206,8 +206,7 @@ def _silver(resolution: int) -> dict[str, Any]:
     )
 
 
-_ALPHA = 0.06
-"""True roughness of the mirror."""
+_ALPHA = 0.06  # true roughness of the mirror
 
 _TRIO_LAMPS = {
     "warm": ((-1.9, 1.9, 0.0), (21.0, 17.0, 12.0)),

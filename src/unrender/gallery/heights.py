@@ -23,8 +23,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
 _CENTRES = ((-0.5, 0.35), (0.5, 0.35), (0.0, -0.45))
-_RADIUS, _PANE, _LAMP = 0.36, 1.4, 3.4
-"""Radius of the lenses, and distances of pane and lamp from the screen."""
+_RADIUS, _PANE, _LAMP = 0.36, 1.4, 3.4  # radius of the lenses, and distances of pane and lamp from the screen
 _HEIGHTS, _START, _LARGEST = (0.2, 0.08, 0.14), 0.12, 0.3
 """True heights in the middle of the lenses, the height of all at the start, and the largest."""
 
@@ -97,11 +96,9 @@ def _bulged(grid: np.ndarray, shapes: np.ndarray, values: Any) -> Any:
     return dr.reshape(mi.TensorXf, mi.TensorXf((grid + [0.0, 0.0, _PANE]).astype(np.float32)) + lifted, -1)
 
 
-_LAMPS = ((-2.2, 0.9, 1.2), (2.2, 0.9, 1.2), (0.0, -2.3, 1.2))
-"""Positions, low at the plaque's side and in front of it."""
+_LAMPS = ((-2.2, 0.9, 1.2), (2.2, 0.9, 1.2), (0.0, -2.3, 1.2))  # positions, low at the plaque's side and in front of it
 _INTENSITY = 14.0
-_DEEPEST = 0.3
-"""Largest height above and below the plaque's plane, whose sides are 2 long."""
+_DEEPEST = 0.3  # largest height above and below the plaque's plane, whose sides are 2 long
 
 
 @register(name="relief", position=34)

@@ -22,7 +22,6 @@ def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool =
     """Return a smooth mesh through a grid of points.
 
     Args:
-        name: id of the mesh.
         positions: (rows, columns, 3); u runs from 0 to 1 along columns, v from 0 to 1 along rows. The front faces columns × rows.
         closed: whether the last column coincides with the first one (with u = 1 there).
 
@@ -205,10 +204,7 @@ def option(about: str) -> Any:
 
 
 def standing(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """Return the file as a Mitsuba dictionary: longest side 1, lowest point at y = 0, centred over the origin.
-
-    Raises `InputError` if it cannot be read or has no extent.
-    """
+    """Return the file as a Mitsuba dictionary: longest side 1, lowest point at y = 0, centred over the origin. Raises `InputError`."""
     low, high = _extent(path)
     scale = 1 / float(np.max(high - low))
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
@@ -216,10 +212,7 @@ def standing(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def centred(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """Return the file as a Mitsuba dictionary: longest side 2, centre of its bounding box at the origin.
-
-    Raises `InputError` if it cannot be read or has no extent.
-    """
+    """Return the file as a Mitsuba dictionary: longest side 2, centre of its bounding box at the origin. Raises `InputError`."""
     low, high = _extent(path)
     return _placed(path, bsdf, 2 / float(np.max(high - low)), (low + high) / 2)
 

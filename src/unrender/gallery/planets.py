@@ -18,14 +18,9 @@ from unrender.gallery import fields, meshes, parts
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-_PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
-"""Radii of the planets and of the two sides of the glass."""
-
-_APART = 1.05
-"""Distance of each planet from the centre."""
-
-_DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
-"""Radiance of zenith, horizon and nadir."""
+_PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0  # radii of the planets and of the two sides of the glass
+_APART = 1.05  # distance of each planet from the centre
+_DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))  # radiance of zenith, horizon and nadir
 
 _SUN = parts.unit([0.3, 0.75, 0.6])
 
@@ -170,10 +165,8 @@ class GlobeAndMirror(fields.Rendered):
         return (Parameter("globe.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),)
 
 
-_NOON = parts.unit([0.45, 0.7, 0.55])
-"""Direction to the sun."""
-_FROM_CENTRE = 0.72
-"""Distance of each object from the centre."""
+_NOON = parts.unit([0.45, 0.7, 0.55])  # direction to the sun
+_FROM_CENTRE = 0.72  # distance of each object from the centre
 
 
 @register(name="three-textures", position=31)

@@ -24,10 +24,8 @@ from unrender.scene.parameter import Parameter
 _SUN = np.array([0.4, 1.0, -0.25])
 _HEIGHT = 4.0
 _RADIUS = 0.32
-_TRUTH, _START = (0.4, -0.3), (-0.45, 0.35)
-"""True centre of the shadow: x and z."""
-_REACH = 0.6
-"""Largest distance of the shadow from the centre of the image, in x and in z."""
+_TRUTH, _START = (0.4, -0.3), (-0.45, 0.35)  # true centre of the shadow: x and z
+_REACH = 0.6  # largest distance of the shadow from the centre of the image, in x and in z
 
 
 @register(name="shadow", position=18)
@@ -121,19 +119,15 @@ def _animal(detail: int) -> list[meshes.Sheet]:
     ]
 
 
-_SIDE = np.radians(105.0)
-"""True angle of the mug's handle: 0 faces the camera, a right angle is to the camera's right."""
-
-_HIDDEN = np.radians(158.0)
-"""Initial angle of the handle."""
+_SIDE = np.radians(105.0)  # true angle of the mug's handle: 0 faces the camera, a right angle is to the camera's right
+_HIDDEN = np.radians(158.0)  # initial angle of the handle
 
 _LABEL_WIDTH, _LABEL_HEIGHTS = np.radians(100.0), (0.24, 0.86)
 """Angle that the label covers, and its lower and upper height."""
 
 _LABEL = "mug.bsdf.brdf_0.bsdf_1.reflectance.data"
 
-_CUP, _ELSEWHERE = (0.0, 0.0), (0.0, 2.0)
-"""Origins of texture coordinates: of the cup, and of parts without a label."""
+_CUP, _ELSEWHERE = (0.0, 0.0), (0.0, 2.0)  # origins of texture coordinates: of the cup, and of parts without a label
 
 
 @register(name="mug", position=17)
@@ -215,14 +209,9 @@ def _lathe(knots: list[tuple[float, float]], rows: int) -> np.ndarray:
     return meshes.lathe(np.interp(where, length, corners[:, 0]), np.interp(where, length, corners[:, 1]), 96)
 
 
-_GREY = 0.4
-"""Colour of the wall behind the squares."""
-
-_CELL = 0.45
-"""Their positions are cells of a 4 by 4 grid."""
-
-_FAR = 10.0
-"""Position of the camera, so distant that squares at different depths have equal size and show no shadow."""
+_GREY = 0.4  # colour of the wall behind the squares
+_CELL = 0.45  # their positions are cells of a 4 by 4 grid
+_FAR = 10.0  # position of the camera, so distant that squares at different depths have equal size and show no shadow
 
 
 @dataclass(frozen=True)

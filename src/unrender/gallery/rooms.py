@@ -84,8 +84,7 @@ class Wall(fields.Rendered):
         return (Parameter("back.bsdf.reflectance.data", initial=0.5),)
 
 
-_BULB = np.array([0.86, 1.68, -0.25])
-"""Centre of the bulb."""
+_BULB = np.array([0.86, 1.68, -0.25])  # centre of the bulb
 
 
 @register(name="lamp", position=4)

@@ -111,11 +111,8 @@ def _read(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     return image
 
 
-_LANES = 1 << 21
-"""Paths per pass of a reference, within the memory of a small machine."""
-
-_REFERENCE = Key(seed=0x9A11E47)
-"""Base of the references' seeds, distinct from those of runs, which count from 0."""
+_LANES = 1 << 21  # paths per pass of a reference, within the memory of a small machine
+_REFERENCE = Key(seed=0x9A11E47)  # base of the references' seeds, distinct from those of runs, which count from 0
 
 
 class Specification(Protocol):
@@ -160,11 +157,7 @@ class ProblemSource(Protocol):
 
 
 def build_problem(name: str, specification: Specification) -> Problem:
-    """Return the problem: true values from the scene, one view per sensor, references by Mitsuba's integrators.
-
-    Args:
-        specification: specification with its options.
-    """
+    """Return the problem: true values from the scene, one view per sensor, references by Mitsuba's integrators."""
     ensure()
     renderer = MitsubaRenderer(specification.scene, specification.max_depth)
     parameters = specification.parameters()

@@ -20,8 +20,7 @@ from unrender.rendering.picture_format import AOVS
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 
-_RADIUS = 0.7
-"""Radius of the sphere; the body fits into a ball of radius about 1."""
+_RADIUS = 0.7  # radius of the sphere; the body fits into a ball of radius about 1
 
 
 @register(name="sphere-to-mesh", position=21)
@@ -228,8 +227,7 @@ def _fir(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 _STATUE_RADIUS = 0.68
-_FINE = 5
-"""Subdivisions of the true mesh."""
+_FINE = 5  # subdivisions of the true mesh
 _PROFILE = (
     *((-1.0, 0.0), (-0.97, 0.4), (-0.6, 0.66), (-0.38, 0.68), (-0.2, 0.34), (-0.05, 0.21)),
     *((0.1, 0.24), (0.3, 0.35), (0.55, 0.38), (0.78, 0.31), (0.95, 0.14), (1.0, 0.0)),

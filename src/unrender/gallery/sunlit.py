@@ -127,8 +127,7 @@ def _painting(resolution: int) -> np.ndarray:
 _FIELD_OF_VIEW = 30.0
 _DISTANCE, _MIDDLE = 4.4, 0.85
 _TEXELS, _MAX_DEPTH = 64, 5
-_WHITE = 0.98
-"""Linear value to which the exposure maps the 99.9th percentile of all values."""
+_WHITE = 0.98  # linear value to which the exposure maps the 99.9th percentile of all values
 
 
 def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int = 256, seed: int = 0) -> Path:

@@ -59,10 +59,8 @@ def positions(resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def noise(resolution: int, octaves: int, seed: int) -> np.ndarray:
-    """Return smooth noise of several octaves in [0, 1], each with half the amplitude and twice the frequency: (resolution,) * 3.
-
-    Equal at every resolution, except for detail that the resolution cannot represent.
-    """
+    """Return smooth noise of octaves in [0, 1], each of half the amplitude at twice the frequency: (resolution,) * 3, alike at any
+    resolution."""
     from scipy.ndimage import map_coordinates
 
     rng = np.random.default_rng(seed)

@@ -56,7 +56,6 @@ class ViewMemory:
     sizes: tuple[tuple[int, int], ...] = ()
 
     def of_views(self) -> tuple[ViewMemory, ...]:
-        """Return the memory of each view."""
         if not self.sizes:
             return (self,)
         parts = [part for name, part in vars(self).items() if name != "sizes"]
@@ -107,7 +106,6 @@ class RecursiveControlVariateState:
         return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
     def of_views(self) -> tuple[ViewMemory, ...]:
-        """Return the memory of each view."""
         return tuple(memory for joined in self.views for memory in joined.of_views())
 
     def of_single_views(self) -> RecursiveControlVariateState:

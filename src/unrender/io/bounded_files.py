@@ -150,10 +150,7 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, folder: Path | None = Non
 
 
 def parse_json(source: str | bytes, where: str) -> Any:
-    """Parse JSON text.
-
-    Raises `InputError` for malformed text, too deep nesting, more than `MOST_VALUES` values, or a duplicate name in an object.
-    """
+    """Parse JSON. Raises `InputError` for malformed text, deep nesting, more than `MOST_VALUES` values, or a name given twice."""
     commas = source.count(b",") if isinstance(source, bytes) else source.count(",")
     if commas > MOST_VALUES:
         raise InputError(f"{where}: more than {MOST_VALUES} values, which no such file holds")
@@ -214,10 +211,7 @@ def _check_plain(value: Any, where: str, depth: int = 0) -> None:
 
 
 def read_float_arrays(path: Path, folder: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz file in a run folder.
-
-    Booleans and floating-point numbers of at most 32 bits become float32, all others float64.
-    """
+    """Read an .npz file in a run folder. Booleans and floats of at most 32 bits become float32, all others float64."""
     arrays = read_arrays(path, LARGEST_ARCHIVE, folder=folder, largest=LARGEST_ARRAY)
     with np.errstate(over="ignore"):
         return {name: array.astype(_float_type(array.dtype)) for name, array in arrays.items()}
@@ -300,10 +294,7 @@ def _reason(error: Exception) -> str:
 
 @dataclass
 class _BoundedReads:
-    """A file that limits the size of single reads; None for no limit.
-
-    `zipfile` reads the entire directory of an archive before it reports the number of members.
-    """
+    """A file that limits single reads, None for no limit: `zipfile` reads a whole directory before it reports the number of members."""
 
     file: IO[bytes]
     where: Path

@@ -122,7 +122,6 @@ def write(picture: Any, path: Path, half: bool = False) -> None:
 
     Args:
         picture: linear (H, W) or (H, W, C) with C of 1, 3 or 4, written as float32; or a `mitsuba.Bitmap`, written as it is.
-        path: the file.
         half: whether to write 16 bits, for OpenEXR.
 
     Raises:

@@ -224,10 +224,7 @@ _MOST_VARIANTS = 1 << 12
 
 
 def check_obj(path: Path) -> None:
-    """Raise `InputError` if a vertex has so many combinations of normals and texture coordinates that Mitsuba would take hours.
-
-    Mitsuba stores them in a list that it searches linearly for each corner.
-    """
+    """Raise `InputError` if a vertex has so many combinations of attributes that Mitsuba, which searches them linearly, takes hours."""
     with bounded_files.open_regular(path) as file:
         if os.fstat(file.fileno()).st_size <= _FREE_BYTES:
             return
@@ -361,10 +358,7 @@ def ply_of(columns: Sequence[tuple[Sequence[str], np.ndarray]], faces: np.ndarra
 
 
 def obj(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None) -> bytes:
-    """Encode a mesh as OBJ text that preserves every bit of float32: vertices, optional texture coordinates, faces.
-
-    Arguments as in `ply`.
-    """
+    """Encode a mesh as OBJ text that preserves every bit of float32. Arguments as in `ply`."""
     lines = ["# written by unrender", *rows("v", vertices)]
     lines += [] if uv is None else rows("vt", upwards(uv))
     corners = faces.astype(np.int64) + 1

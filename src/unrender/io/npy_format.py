@@ -51,10 +51,7 @@ def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], No
 
 
 def _read_header(file: IO[bytes], where: str) -> tuple[np.dtype, bool, Shape]:
-    """Return the type, which is real, whether the order is column-major, and the shape.
-
-    NumPy's own reader evaluates the header as a Python literal, which can take long for a hostile one.
-    """
+    """Return the real type, whether the order is column-major, and the shape. NumPy's own reader may be slow for a hostile header."""
     start = file.read(8)
     if start[:6] != _MAGIC or len(start) < 8:
         raise MalformedHeader

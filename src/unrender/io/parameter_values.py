@@ -173,10 +173,7 @@ def _check_shape(array_shape: tuple[int, ...], shape: tuple[int, ...], conversio
 
 
 def _is_unflattened(array_shape: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Return whether an array lacks a last axis of length 1, or is (V, n) for values (n V,).
-
-    An array with 1 < V < n does not qualify, since it is more likely (n, V).
-    """
+    """Return whether an array lacks a last axis of length 1, or is (V, n) for (n V,), unless 1 < V < n: it is likely (n, V) then."""
     if len(shape) == 1 and len(array_shape) == 2:
         rows, columns = array_shape
         return rows * columns == shape[0] and (rows >= columns or rows == 1)

@@ -61,10 +61,7 @@ def resize_nearest(coarse: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def reduced(array: np.ndarray, largest: int, axes: int = 2) -> np.ndarray:
-    """Reduce an array by box filtering with an integer factor, so that its first `axes` sides are at most `largest`.
-
-    Borders are repeated if the factor does not divide a side. An array that is small enough is returned unchanged.
-    """
+    """Box-filter an array by an integer factor, so that `axes` sides are at most `largest`. Borders are repeated; small arrays stay."""
     sides = array.shape[:axes]
     factor = -(-max(sides, default=0) // largest)
     if factor <= 1:

@@ -132,8 +132,7 @@ _DEEPEST_INCLUDE = 14
 _MOST_INCLUDES = 1000
 _MOST_ELEMENTS = 1 << 20
 _LARGEST = 1 << 26
-_LONGEST_VALUE = 1 << 12
-"""Largest number of characters of an attribute in which parameters are substituted."""
+_LONGEST_VALUE = 1 << 12  # largest number of characters of an attribute in which parameters are substituted
 _MOST_PARAMETERS = 1000
 
 
@@ -151,10 +150,7 @@ class SceneFiles:
 
 
 def of(scene: Path) -> list[Path]:
-    """Return the XML file, its includes, and existing textures, meshes and other files that they refer to; each once.
-
-    Raises `InputError`, see `read`.
-    """
+    """Return the XML file, its includes, and the existing files that they refer to, once each. Raises `InputError`, see `read`."""
     files = read(scene)
     return list(dict.fromkeys([*files.xml, *files.named]))
 

@@ -75,10 +75,7 @@ def _is_big(data: bytes) -> bool:
 
 
 def _first_tags(data: bytes, file: IO[bytes]) -> tuple[dict[int, int], dict[int, slice]]:
-    """Return the first value of each tag of an integer type, and the position of its entry.
-
-    Raises `ValueError` if width or height are missing.
-    """
+    """Return the first value of each tag of an integer type, and its entry's position. Raises `ValueError` without width or height."""
     order = "<" if data[:2] == b"II" else ">"
     big = _is_big(data)
     (start,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)

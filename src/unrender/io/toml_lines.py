@@ -137,10 +137,7 @@ def _lines(text: str) -> dict[Place, int]:
 
 
 def _statement(rows: list[str], start: int) -> tuple[dict[str, Any] | None, int]:
-    """Return the parsed header or key of the statement at row `start`, and the row after the statement.
-
-    A statement ends where its brackets and strings are closed.
-    """
+    """Return the parsed header or key at row `start`, and the row after its statement, where brackets and strings are closed."""
     depth, quote, end = 0, "", start
     while end < len(rows):
         depth, quote = _open_after(rows[end], depth, quote)
@@ -233,7 +230,6 @@ def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tupl
 
 
 def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
-    """Return the error for one field of a file."""
     return InputError(f"{file}:{find(text, place)}: {dotted(place)}: {what}")
 
 

@@ -79,10 +79,7 @@ def displayed(
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the peak signal-to-noise ratio of the display images in dB, 10 log10(1 / MSE); infinite for equal images.
-
-    Larger is better.
-    """
+    """Return the peak signal-to-noise ratio of the display images in dB, 10 log10(1 / MSE); larger is better, infinite for equal images."""
     shown, target = displayed(image, reference, mask)
     error = _mean((shown - target) ** 2, mask)
     return 10 * math.log10(1 / error) if error > 0 else math.inf
@@ -105,10 +102,8 @@ def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
 
 
 def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree. Smaller is better.
-
-    Raises `InputError` if the package flip-evaluator is missing.
-    """
+    """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree. Raises `InputError` without
+    its package."""
     try:
         import flip_evaluator
     except ImportError as error:
@@ -119,10 +114,7 @@ def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
 
 
 def relative_mse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean over pixels and channels of (I - R)² / (R² + 0.01), in linear values. Smaller is better.
-
-    Infinite if a value is not finite. Raises `InputError` for images of different sizes.
-    """
+    """Return the mean of (I - R)² / (R² + 0.01) in linear values; infinite if one is not finite. Raises `InputError` for unequal sizes."""
     image, reference = _pair(image, reference, mask)
     with np.errstate(over="ignore", invalid="ignore"):
         error = _mean((image - reference) ** 2 / (reference**2 + RELATIVE_EPSILON), mask)
@@ -130,10 +122,7 @@ def relative_mse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | No
 
 
 def rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the root mean square difference in linear values. Smaller is better.
-
-    Infinite if a value is not finite. Raises `InputError` for images of different sizes.
-    """
+    """Return the root mean square difference in linear values; infinite if one is not finite. Raises `InputError` for unequal sizes."""
     image, reference = _pair(image, reference, mask)
     with np.errstate(over="ignore", invalid="ignore"):
         error = math.sqrt(_mean((image - reference) ** 2, mask))
@@ -164,8 +153,7 @@ def has_flip() -> bool:
 
 
 MISSING = "LPIPS is not reported: it needs pip install lpips, and AlexNet's weights in PyTorch's folder hub/checkpoints"
-_LEAST = 32
-"""Smallest side in pixels that the network accepts."""
+_LEAST = 32  # smallest side in pixels that the network accepts
 
 
 def available() -> bool:

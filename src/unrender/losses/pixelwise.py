@@ -13,8 +13,7 @@ from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
-_CLEARLY = 4.0
-"""Standard errors by which images are darker than a lower bound that they do not reach."""
+_CLEARLY = 4.0  # standard errors by which images are darker than a lower bound that they do not reach
 
 
 @register(position=1)

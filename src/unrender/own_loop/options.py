@@ -111,10 +111,7 @@ def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPo
 
 
 def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...], scene: Any) -> Problem:
-    """Return a problem whose views are these sensors. Raises `InputError` for a sensor that the scene does not have.
-
-    Sensors without a reference get a black one, because a view needs one.
-    """
+    """Return a problem of these sensors, those without a reference with a black one. Raises `InputError` for an unknown sensor."""
     sizes = renderer.resolutions()
     references = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
     for sensor in sensors:

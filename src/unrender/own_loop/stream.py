@@ -126,7 +126,6 @@ class Stream:
 
     Args:
         problem: problem with the sensors as its views.
-        options: options of the `Renderer`.
 
     Attributes:
         state: state between steps.

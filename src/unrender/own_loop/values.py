@@ -172,7 +172,7 @@ class Exchange:
     def tree(self, inputs: LoopParameters) -> Tree:
         """Return the parameters as arrays of the renderer, detached. Raises `InputError` for a wrong shape or NaN."""
         if inputs.framework == "drjit" and self._on_device:
-            from unrender.rendering.mitsuba.tensors import to_tensor
+            from unrender.rendering.mitsuba.parameters import to_tensor
 
             tree = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in inputs.values.items()}
             dr.make_opaque(tree)
@@ -223,10 +223,7 @@ class Exchange:
                 return to_torch(arrays.numpy(image), like)
 
     def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
-        """Return the derivative of the loop's loss with respect to an image of this shape as the renderer's array.
-
-        Raises `InputError` for another shape, or values that are not finite.
-        """
+        """Return a loop's derivative by an image as the renderer's array. Raises `InputError` for another shape or non-finite values."""
         got = shape_of(derivative)
         if got != shape:
             raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {got}")
@@ -254,7 +251,7 @@ class Exchange:
             case "drjit":
                 if not arrays.is_drjit(value):
                     return gradient
-                from unrender.rendering.mitsuba.tensors import from_tensor
+                from unrender.rendering.mitsuba.parameters import from_tensor
 
                 return from_tensor(gradient, value)
 

@@ -22,17 +22,10 @@ from unrender.scene.batches import PixelSample, SampleShares
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler
 
-_TILES = 1 << 16
-"""Maximum number of tiles of all views; tiles are single pixels if there are no more pixels."""
-
-_FIRST = 4
-"""Number of initial steps that all update the maps."""
-
-_COUNTED = 8
-"""Number of map updates between two counts of path vertices."""
-
-_MEMORY = 0.8 ** (1 / 20)
-"""Decay per step of the weight of earlier samples."""
+_TILES = 1 << 16  # maximum number of tiles of all views; tiles are single pixels if there are no more pixels
+_FIRST = 4  # number of initial steps that all update the maps
+_COUNTED = 8  # number of map updates between two counts of path vertices
+_MEMORY = 0.8 ** (1 / 20)  # decay per step of the weight of earlier samples
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,6 @@ class AdaptiveCountsState:
         counts: weighted number of paths of each tile, (tiles,); earlier ones count less.
         density: relative density of additional samples, with mean 1 over the pixels, (tiles,).
         uniform: fraction of these that is equal for all pixels.
-        evidence: evidence for that fraction.
         since: number of steps since the last map update.
         costs: cost of a path through each tile, relative to one without an intersection, (tiles,).
         learnt: number of map updates from steps.

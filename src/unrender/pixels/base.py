@@ -14,8 +14,7 @@ from unrender.scene.batches import PixelSample, SampleShares
 from unrender.scene.problem import Problem
 
 _FEWEST_REFUSED = 1 << 16
-_MOST_DRAWS = 4
-"""Number of samples per pixel of all views above which a large mini-batch is refused."""
+_MOST_DRAWS = 4  # number of samples per pixel of all views above which a large mini-batch is refused
 
 
 @dataclass(frozen=True)

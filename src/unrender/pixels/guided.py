@@ -26,8 +26,7 @@ _FEWEST_PATHS, _FIRST_PATHS = 4096, 8
 For small mini-batches it is a multiple of their pixels, and tiles are updated less often.
 """
 
-_OBSERVED = 4
-"""Steps between updates of the gradient's second moment."""
+_OBSERVED = 4  # steps between updates of the gradient's second moment
 
 _MEMORY = 0.8 ** (1 / 20)
 """Decay per step of the weight of earlier samples. The scene changes little from step to step, so averaging reduces noise."""
@@ -39,8 +38,7 @@ Later, the samples of one step between two updates contribute to the next update
 probabilities a denoising.
 """
 
-_COUNTED = 8
-"""Importance-map updates between two counts of path vertices."""
+_COUNTED = 8  # importance-map updates between two counts of path vertices
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,6 @@ class GuidedSamplerState:
         counts: weighted number of paths of each tile and map, (tiles,) each; earlier ones count less.
         denoised: the denoised first maps, against which samples are compared.
         density: importance map relative to uniform sampling, (tiles,).
-        uniform: fraction of uniform samples.
-        evidence: evidence for that fraction.
         since: number of steps since the last map update.
         costs: cost of a path through each tile, relative to one without an intersection, (tiles,); ones if not counted.
     """
@@ -113,10 +109,7 @@ class ImportanceRule(ABC):
 
 @dataclass(frozen=True)
 class GuidedSampler:
-    """Sampler of mini-batches in proportion to an importance map, mixed with uniform sampling.
-
-    `owner` is the public sampler, and all but its rule are options that `Adaptive` documents.
-    """
+    """Sampler of mini-batches by an importance map and uniform sampling, with the options of `Adaptive` but for `owner` and `rule`."""
 
     owner: str
     rule: ImportanceRule

@@ -66,8 +66,7 @@ def _halved(x: np.ndarray) -> np.ndarray:
 
 MapDenoiser = Literal["auto", "oidn", "optix", "pooling", "variation", "none"]
 
-_MARGIN = 4
-"""Tiles of padding around each map if several are denoised in one image."""
+_MARGIN = 4  # tiles of padding around each map if several are denoised in one image
 
 
 def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.ndarray) -> np.ndarray:
@@ -95,10 +94,7 @@ def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.nd
 
 
 def denoise_side_by_side(maps: np.ndarray, denoise: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Apply `denoise` to maps (n, rows, columns, 3) side by side in one image, because each call has a fixed cost.
-
-    Mirrored margins prevent the filter from mixing neighbouring maps.
-    """
+    """Apply `denoise` to maps (n, rows, columns, 3) in one image, since each call has a fixed cost, with mirrored margins between them."""
     count, rows, columns, _ = maps.shape
     across = math.ceil(math.sqrt(count))
     down = math.ceil(count / across)
@@ -118,8 +114,7 @@ ROUNDS = 16
 """Maximum number of sign patterns of an estimate. Products of different derivatives average to zero over patterns; squares remain."""
 
 
-_DECAY = 0.9
-"""Decay of the running mean of the gradient's squares."""
+_DECAY = 0.9  # decay of the running mean of the gradient's squares
 
 _FLOOR, _LEAST = 0.1, 1e-30
 """Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
@@ -291,10 +286,7 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
 
 
 def observed(problem: Problem, second_moment: Tree, gradient: Tree) -> Tree:
-    """Return the running mean square of the gradient with respect to v, after a further `gradient` with respect to u.
-
-    See `scene.coordinates`. Elements that are not finite count as zeros.
-    """
+    """Return the running mean square of the gradient with respect to v, after one with respect to u, whose non-finite elements are 0."""
     pulled = problem.coordinates.pull_back(gradient, {})
     squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)
     if not second_moment or trees.shapes(second_moment) != trees.shapes(squares):

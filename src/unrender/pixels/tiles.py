@@ -150,7 +150,6 @@ class InverseCdfTable:
         """Build the table from the tiles' probabilities (tiles,), all positive; they are rounded to multiples of 2⁻³², never to 0.
 
         Args:
-            tiles: tiles to sample.
             probabilities: probabilities with any positive sum.
             array: function that makes arrays of the renderer.
         """

@@ -52,7 +52,6 @@ def observed(
     """Return the evidence updated by further samples.
 
     Args:
-        evidence: evidence so far.
         samples: y, second moments of the samples divided by their probability relative to uniform sampling, (2, N). Their sum estimates
             the second moment under uniform sampling.
         density: q, the map at each sample, relative to uniform sampling, (N,).
@@ -78,7 +77,6 @@ def choose(evidence: ShareEvidence, cost: float = 1.0, gain: Callable[[np.ndarra
     Without evidence λ is `MOST`. Heavy tails, which a few samples dominate, keep λ large.
 
     Args:
-        evidence: evidence from samples.
         cost: relative cost of a path sampled by the map; J is multiplied by λ + (1 - λ) times it.
         gain: `gain` of `observed`; gain(λ) replaces λ in ε / λ.
     """

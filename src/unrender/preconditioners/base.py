@@ -53,7 +53,6 @@ class HeldElements:
     It does not spread the gradient of elements that cannot move over their neighbours.
 
     Attributes:
-        inner: the preconditioner S.
         free: 0 for elements that stay, 1 for the others.
     """
 

@@ -126,10 +126,8 @@ _COARSEST = 1 << 16
 """Maximum number of cells of the coarsest level, and of the samples of each finer level in `GridPyramid.summary`."""
 _PER_OCTAVE, _FINER = 8, 3
 """Frequencies per octave and direction at which weights are fitted, and octaves below the coarsest level that the fit includes."""
-_CORRECTED = 0.3
-"""Gain of the interpolation at which the coarsest level corrects the error of the sum by half."""
-_SMALLEST = 1e-12
-"""Smallest gain that is divided by."""
+_CORRECTED = 0.3  # gain of the interpolation at which the coarsest level corrects the error of the sum by half
+_SMALLEST = 1e-12  # smallest gain that is divided by
 
 
 class GridPyramid:

@@ -27,8 +27,7 @@ _POLE_FACTOR = 16.0
 A ratio of 4 has smaller errors and needs twice as many solvers.
 """
 _WEAKEST_POLE = 1 / 16
-_SAMPLES = 200
-"""Number of points of the spectrum of L at which such a sum is fitted."""
+_SAMPLES = 200  # number of points of the spectrum of L at which such a sum is fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +45,7 @@ class MeshTopology:
 
     @classmethod
     def of(cls, positions: np.ndarray, faces: np.ndarray, welded: bool = True) -> MeshTopology:
-        """Build the topology of a mesh with initial positions (V, 3) and faces (F, 3).
-
-        With `welded`, vertices at the same position form one place; otherwise they are neighbours.
-        """
+        """Build the topology of a mesh, (V, 3) and (F, 3). Vertices at the same position are one place if `welded`, else neighbours."""
         _, places = weld(positions)
         if welded:
             return cls(places, _pairs(_edges(places[faces])))
@@ -116,10 +112,7 @@ class MeshSolver:
         return CholeskySolverF(matrix.shape[0], rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """Return B (C + λ L)^-1 Bᵀ x, (n V,) float32, for each of the n channels separately.
-
-        Raises `InputError` for another number of vertices.
-        """
+        """Return B (C + λ L)^-1 Bᵀ x, (n V,) float32, for each of n channels. Raises `InputError` for another number of vertices."""
         values = self._topology.split("LargeSteps", np.asarray(x, np.float32))
         return self.solve_places(self._topology.gathered(values))[self._topology.places].reshape(-1)
 

@@ -37,9 +37,6 @@ class ExposedRenderer(PictureFactors):
 
     Args:
         sensors: indices of the sensors that have a row, in the order of the rows. Pictures of other sensors do not change.
-
-    Attributes:
-        notices: of the inner renderer.
     """
 
     key = EXPOSURE
@@ -131,9 +128,6 @@ class VignettedRenderer(PictureFactors):
     The factor at the centre is 1, so vignetting cannot represent a common brightness of all photographs.
 
     `PictureFactors` states the biases.
-
-    Attributes:
-        notices: of the inner renderer.
     """
 
     key = VIGNETTING

@@ -37,8 +37,7 @@ _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
         dr.sqrt(a) if isinstance(b, float) and b == 0.5 else a**b
     ),  # Dr.Jit's derivative of 0 ** 0.5 is 0
 }
-_LONGEST, _DEEPEST = 1000, 50
-"""Characters and nesting of a text form."""
+_LONGEST, _DEEPEST = 1000, 50  # characters and nesting of a text form
 
 
 def parse(key: str, text: str) -> Function:

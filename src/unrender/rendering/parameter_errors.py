@@ -14,8 +14,7 @@ Role = Literal["value", "height", "ratios", "normal", "direction"]
 """Meaning of a parameter's values: numbers, heights of which only differences matter, vectors of which only the ratios of their elements
 matter, a normal map (n = 2 x - 1), or vectors of which only the direction matters."""
 
-_MOST_COLUMNS = 8
-"""Maximum number of repeated columns that a record may state."""
+_MOST_COLUMNS = 8  # maximum number of repeated columns that a record may state
 _SHORTEST = 1e-12
 """Minimum length of a vector that has a direction. A shorter vector has an angle of 90°, and no factor."""
 
@@ -39,12 +38,10 @@ class ErrorMeasure:
 
     @property
     def is_angle(self) -> bool:
-        """Return whether the error is an angle."""
         return self.role in ("normal", "direction")
 
     @property
     def name(self) -> str:
-        """Short name of the error."""
         names = {"height": "RMSE without the mean", "ratios": "RMSE up to a factor"}
         return "mean angle" if self.is_angle else names.get(self.role, "RMSE")
 

@@ -33,7 +33,6 @@ class ParameterInfo:
     """Description of a renderer's parameter.
 
     Attributes:
-        shape: shape of its array.
         differentiable: whether `adjoint` can return its gradient.
         shares_paths: whether two values of it can share one set of paths (path space); paths of a moving mesh are related, not equal.
         reason: reason why it is not differentiable or cannot share paths; else "".
@@ -107,7 +106,6 @@ class SampleRequest:
     """Request for samples of a sensor's pixels.
 
     Attributes:
-        sensor: index of the sensor.
         spp: samples per pixel of all groups together; a multiple of `groups`.
         seed: integer in [0, 2**32), from `Key.uint32()`.
         groups: number of independent images that the samples are split into.

@@ -18,8 +18,7 @@ RESPONSE_BOUND = 1.5
 """Bound of the absolute values. It corresponds to exponents from 0.22 to 4.5."""
 _SLANT = 1.6
 """Shoulder per unit of contrast. Contrast then increases about a radiance of 0.37, which the sRGB curve encodes as 0.64."""
-_DARK = 2.0**-10
-"""Radiance below which curves are linear. The slope of a power at 0 is infinite or 0."""
+_DARK = 2.0**-10  # Radiance below which curves are linear. The slope of a power at 0 is infinite or 0.
 
 
 @dataclass(frozen=True)
@@ -88,9 +87,6 @@ class RespondingRenderer(PictureRenderer):
 
     Args:
         inner: renderer of the scene, including exposure.
-
-    Attributes:
-        notices: of the inner renderer.
     """
 
     key = RESPONSE

@@ -27,8 +27,7 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper, combined, unwrapped
 
-_ENCODED = ("normal", "direction")
-"""Roles whose values represent vectors. Heights are numbers."""
+_ENCODED = ("normal", "direction")  # Roles whose values represent vectors. Heights are numbers.
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,7 @@ class World:
 
 
 def with_worlds(renderer: Renderer, worlds: Sequence[World]) -> tuple[Renderer, list[int]]:
-    """Return a renderer with a sensor for each world, and the indices of these sensors.
-
-    A renderer that has them already is returned as it is. Wrappers around the scene's renderer stay around the result.
-    """
+    """Return a renderer with a sensor for each world, inside its wrappers, and their indices; itself if it has them already."""
     if not worlds:
         return renderer, []
     if isinstance(renderer, WorldsRenderer):

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
-_LEAST_SPP, _FEW_PIXELS = 2, 4096
-"""Least samples per pixel, and pixels per step, that it advises."""
+_LEAST_SPP, _FEW_PIXELS = 2, 4096  # least samples per pixel, and pixels per step, that it advises
 _END_SHARE, _END_SECONDS = 0.1, 1.0
 """Time reserved for verification and final images: a fraction of the budget, plus seconds."""
 _LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
@@ -32,10 +31,8 @@ _LEAST_SHARE = 0.5
 """Fraction of the budget that the steps get even if the warm-up takes long, within the following limits."""
 _LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
 """Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
-_PAGE_SECONDS = 1.0
-"""Time of the page and the summary on an idle machine."""
-_MOST_STEPS = 1 << 63
-"""Exclusive limit that the files of a run folder can store."""
+_PAGE_SECONDS = 1.0  # time of the page and the summary on an idle machine
+_MOST_STEPS = 1 << 63  # exclusive limit that the files of a run folder can store
 
 
 class Budget(Callback):
@@ -90,10 +87,7 @@ class Budget(Callback):
 
 
 def slowdown() -> float:
-    """Return the slowdown of this process by others, >= 1: its elapsed time over its time on an idle machine.
-
-    It is measured by the time that its threads waited for a processor; 1 if the system does not provide it.
-    """
+    """Return the time of this process over that on an idle machine, >= 1, from the waits of its threads; 1 if unknown."""
     running = waiting = 0
     for path in glob.glob("/proc/self/task/*/schedstat"):
         try:

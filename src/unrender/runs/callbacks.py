@@ -52,10 +52,7 @@ class Callback(Listener):
         """Called after each step, with its record, the last of the history. `run.stop()` ends the run."""
 
     def on_result(self, run: Run, result: Result) -> Result:
-        """Called after the last step. Returns the result, possibly with additions.
-
-        The run folder is written before the user's callbacks are called.
-        """
+        """Called after the last step, and after the run folder is written. Returns the result, possibly with additions."""
         return result
 
     def on_error(self, run: Run, error: BaseException) -> None:
@@ -134,5 +131,4 @@ class PhaseTimes(Callback):
 
 
 def with_phase(result: Result, name: str, seconds: float) -> Result:
-    """Return the result with an additional phase."""
     return replace(result, phases={**result.phases, name: seconds})

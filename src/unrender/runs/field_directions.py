@@ -78,7 +78,6 @@ def add_field_directions(
     remainder.
 
     Args:
-        numbers: the numbers alone.
         keys: keys of the textures and grids, see `fields_of`; at least one.
         sensitivities: see `unrender.sensitivity`.
         change: root mean square of a difference.

@@ -191,10 +191,7 @@ def shown_elsewhere(problem: Problem, sensitivity: np.ndarray | None, step: np.n
 
 
 def _smooth_eigenvalue(squares: np.ndarray, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return tr(SAS) / tr(SS) of `Curvature`, at least 1, from diagonal elements and the projections of probes.
-
-    It is infinite for too few projections, or without a curvature.
-    """
+    """Return tr(SAS) / tr(SS) of `Curvature`, at least 1, by the probes' projections; infinite for too few, or without a curvature."""
     if len(stored) < FEWEST_PROBES or not (squares > 0.0).any():
         return np.inf
     diagonal = squares.mean(axis=-1)
@@ -294,10 +291,7 @@ def adjoint_spp(problem: Problem) -> int:
 
 
 def derivative_session(problem: Problem) -> tuple[RenderSession | None, frozenset[str]]:
-    """Return a session with derivatives, and their keys: all, or all that are differentiable and no poses.
-
-    The session is None, without keys, if no unknown has a path gradient.
-    """
+    """Return a session with derivatives and their keys: all, or all differentiable ones but poses; None without path gradients."""
     known, keys = problem.renderer.parameters(), list(problem.shapes())
     for chosen in (keys, [key for key in keys if known[key].differentiable and not known[key].rigid]):
         if chosen:

@@ -125,10 +125,7 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
 
 
 def _step(run: Run) -> dict[str, Any]:
-    """Take one step, and return its record of the history.
-
-    A step is not applied if its estimate is not finite, or if the optimizer's step is not finite.
-    """
+    """Take one step and return its record. It is not applied if its estimate or the optimizer's step is not finite."""
     state, started = run.state, time.perf_counter()
     mean = run.state.noise.mean
     free = {} if mean is None else free_of_bounds(run.problem, run.parameters, mean, run.step)

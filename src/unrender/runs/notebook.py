@@ -136,7 +136,6 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
 
 
 def measures(result: Result) -> dict[str, ErrorMeasure]:
-    """Return {key: error measure}."""
     recorded = result.problem.get("measures", {})
     return {key: parameter_errors.from_record(recorded.get(key)) for key in result.parameters}
 

@@ -42,7 +42,6 @@ class NumberTrace:
     count: int = 0
 
     def append(self, values: np.ndarray) -> None:
-        """Append the values (n,) of a step."""
         self.total = self.total + values if self.count else values
         self.count += 1
         if self.count < self.size:

@@ -147,7 +147,6 @@ def connected(
     The first ones of the folder restore a run, so that they come before all others. The last one writes.
 
     Args:
-        callbacks: the user's callbacks.
         folder: callbacks of the run folder, the writer last.
         earlier: seconds of phases before the run.
     """

@@ -95,10 +95,7 @@ def refine(run: Run) -> float:
 
 
 class Refinement(Callback):
-    """Callback that refines parameters and states before the steps at which their resolution changes, and records the resolutions.
-
-    Compiling the kernels of the new resolution counts as warm-up.
-    """
+    """Callback that refines parameters and states at changes of resolution, and records these. Compiling counts as warm-up."""
 
     def __init__(self) -> None:
         self._refined = False
@@ -119,10 +116,7 @@ class Refinement(Callback):
 
 
 def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
-    """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also the initial values of these parameters.
-
-    Raises `InputError` if the renderer does not support it.
-    """
+    """Return the problem with other meshes {key: mesh}, also as initial values. Raises `InputError` if the renderer cannot change them."""
     if not isinstance(problem.renderer, Remeshable):
         raise InputError(f"{', '.join(meshes)}: this renderer does not support remeshing")
     schedules = [
@@ -150,10 +144,7 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
 
 
 class MeshRefinement(Callback):
-    """Callback that remeshes before the steps in `Parameter.remeshing`. Compiling new kernels counts as warm-up.
-
-    If a mesh cannot be remeshed, it stays unchanged, with a warning.
-    """
+    """Callback that remeshes before the steps in `Parameter.remeshing`. A mesh that cannot be remeshed stays, with a warning."""
 
     def __init__(self) -> None:
         self._made: dict[str, int] = {}
@@ -201,14 +192,12 @@ class MeshRefinement(Callback):
             self._made = {}
 
 
-_USED, _FEWEST_STEPS = 0.4, 16
-"""Fraction of the budget, and number of steps, after which values are compared once."""
+_USED, _FEWEST_STEPS = 0.4, 16  # fraction of the budget, and number of steps, after which values are compared once
 _SHARE, _LEAST_PATHS, _MOST_SHARE = 0.5, 1 << 14, 2.5
 """Paths of all pictures relative to the run's so far, the least number of one, and the share above which a short run is not compared."""
 BEGUN_AGAIN = "begins again at step"
 """First words of the line about other values."""
-_NUMBER, _KEPT = 4, "kept"
-"""Index of the set of random numbers; outcome of a comparison without a better place."""
+_NUMBER, _KEPT = 4, "kept"  # index of the set of random numbers; outcome of a comparison without a better place
 
 
 class OtherStart(Callback):

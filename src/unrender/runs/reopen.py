@@ -76,10 +76,7 @@ def with_meshes(problem: Problem, run: RunFolder) -> Problem:
 
 
 def scene_changes(problem: Problem, run: RunFolder) -> list[str]:
-    """Return a notice if the scene of the reopened problem is no longer that of the run, else nothing.
-
-    What a run recovered suits its own scene only.
-    """
+    """Return a notice if the reopened scene is no longer that of the run, whose result suits that scene only; else nothing."""
     before = run.record.problem.fingerprint
     parts = [] if before is None else differences(_of_scene(before), _of_scene(fingerprint(problem)))
     if not parts:

@@ -162,10 +162,8 @@ class _Source:
 
 
 def _sources(stored: StoredRun) -> Iterator[_Source]:
-    """Yield the readable checkpoints whose steps are in the history, latest first; the run's start if there are none.
-
-    Raises `InputError` if all existing ones are unusable.
-    """
+    """Yield the readable checkpoints whose steps are in the history, latest first, or the run's start. Raises `InputError` if all are
+    unusable."""
     path = stored.folder / HISTORY
     records, malformed = history.read_records(path, stored.folder) if path.exists() else ([], "")
 

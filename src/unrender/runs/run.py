@@ -36,7 +36,6 @@ class Run:
     Attributes:
         plan: Plan of the run, with the problem as passed.
         problem: Problem with the plan's settings and the current meshes.
-        estimator, optimizer, seed: components and seed.
         steps, seconds: the budget; None for no limit.
         folder: the run folder; None without one.
         step: number of completed steps.
@@ -49,7 +48,6 @@ class Run:
         warmup_seconds: seconds of tracing and compiling.
         skipped: number of steps that were not applied.
         ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
-        warnings: one line each.
         few_steps: the one of them that says that the budget allows few steps; "" for none.
         stopped: reason to end after the current step; "" for none.
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
@@ -217,7 +215,6 @@ class RunState:
     """State of a run from step to step, in addition to `Run`'s parameters.
 
     Attributes:
-        estimator, optimizer: their states.
         noise: statistics of the gradient so far.
         zero_gradient: {key: whether its gradient has always been exactly zero}.
         samples: number of paths so far.
@@ -293,8 +290,7 @@ def to_numpy(info: Any) -> Any:
 
 
 _DECAY = 0.9
-_EVERY = 7
-"""Stride at which elements of large arrays are sampled, to save the memory of a mean gradient."""
+_EVERY = 7  # stride at which elements of large arrays are sampled, to save the memory of a mean gradient
 
 
 @dataclass

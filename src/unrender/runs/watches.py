@@ -23,10 +23,8 @@ from unrender.scene.surfaces import crossing_triangles, folds
 if TYPE_CHECKING:
     from unrender.runs.run import Run
 
-_NEAR = 0.01
-"""Distance to a bound, relative to the range, below which a number counts as at the bound."""
-_SHARE = 0.05
-"""Share of the elements of a texture, grid or colour that must be at a bound."""
+_NEAR = 0.01  # distance to a bound, relative to the range, below which a number counts as at the bound
+_SHARE = 0.05  # share of the elements of a texture, grid or colour that must be at a bound
 
 
 class BoundsWatch(Callback):
@@ -156,8 +154,7 @@ def _joined(run: Run, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return start[first], end[first], places[run.problem.faces[key]]
 
 
-_LARGEST_STEP = 0.5
-"""Fraction of a bounded parameter's range: a longer first step always ends at a bound."""
+_LARGEST_STEP = 0.5  # fraction of a bounded parameter's range: a longer first step always ends at a bound
 
 
 def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:

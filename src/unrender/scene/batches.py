@@ -127,10 +127,7 @@ class Frame(Protocol):
         ...
 
     def loss_value(self, image: Array) -> Array:
-        """Return the loss of these pixels, a lazy scalar.
-
-        For a mini-batch and an exact image it estimates the total loss without bias.
-        """
+        """Return the loss of these pixels, a lazy scalar. For a mini-batch and an exact image it estimates the total without bias."""
         ...
 
     def loss_derivative(self, image: Array) -> Array:
@@ -241,7 +238,6 @@ class JoinedViews(PixelBatch):
 
     Attributes:
         memory: index of this frame in its step.
-        views: indices of the views.
         seeds: seed of each pixel, (N,), integers.
     """
 

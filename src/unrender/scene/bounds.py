@@ -25,13 +25,11 @@ _LOBE_START = 0.01
 """Distance from an end of the range, as a fraction of it, to which a start is moved if a lobe would never be sampled."""
 _ROUNDING = 1e-6
 """Distance of a true value from the bounds that rounding explains, relative to the largest value or to 1."""
-_HALF_PRECISION = 2.0**-11
-"""Largest relative change of a value that is rounded to half precision."""
+_HALF_PRECISION = 2.0**-11  # largest relative change of a value that is rounded to half precision
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
-_FULL_TURN = 2.0 * math.pi + 1e-4
-"""Largest angle in radians that is plausible, with a margin for rounding."""
+_FULL_TURN = 2.0 * math.pi + 1e-4  # largest angle in radians that is plausible, with a margin for rounding
 
 
 def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
@@ -167,10 +165,7 @@ def move_inside(start: np.ndarray, bounds: Bounds, info: ParameterInfo) -> tuple
 
 
 def _sampled_lobe(start: np.ndarray, info: ParameterInfo) -> tuple[np.ndarray, str]:
-    """Return a start at which each lobe is sampled now and then, and a notice of the change, "" for none.
-
-    A map whose values are not all at one end stays as it is.
-    """
+    """Return a start, moved off an end where none of its values ever samples a lobe, and a notice of that, "" for none."""
     low, high = info.lowest, info.highest
     if not info.lobe or low is None or high is None or not start.size:
         return start, ""

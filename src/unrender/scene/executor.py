@@ -8,10 +8,7 @@ import numpy as np
 
 
 class Executor(Protocol):
-    """Executor of an estimator's requests.
-
-    A request is plain data: `estimators.sample_groups.GradientRequest` or `pixels.pixel_statistics.PilotRequest`.
-    """
+    """Executor of an estimator's requests, which are plain data: `GradientRequest` or `pixel_statistics.PilotRequest`."""
 
     @property
     def variant(self) -> str | None:

@@ -9,12 +9,10 @@ from collections.abc import Mapping
 from unrender.core.text import did_you_mean
 from unrender.rendering.renderer import ParameterInfo
 
-_NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
-"""Ids that Mitsuba generates for objects without one."""
+_NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")  # ids that Mitsuba generates for objects without one
 _OBJECT = re.compile(r"([^.]*(?:\.\d+)*)\.")
 _TRANSFORM = "to_world"
-_INSIDE = "nested_texture"
-"""Slot of the texture of a bump map, which its scale multiplies."""
+_INSIDE = "nested_texture"  # slot of the texture of a bump map, which its scale multiplies
 _PLACES = (
     _TRANSFORM,
     "translation",
@@ -30,8 +28,7 @@ _PLACES = (
 )
 """Names that users may try for the parameters of a pose."""
 _POSE = ("translation", "rotation", "scale")
-_SLOTS = frozenset({"bsdf", "data", "value", ""})
-"""Parts of keys that do not name a quantity."""
+_SLOTS = frozenset({"bsdf", "data", "value", ""})  # parts of keys that do not name a quantity
 _EQUIVALENTS = (
     {"alpha", "roughness"},
     {"reflectance", "base_color", "diffuse_reflectance", "albedo", "color", "colour"},

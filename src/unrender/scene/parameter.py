@@ -78,14 +78,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """Settings that a method chooses for a parameter whose own are None.
+    """Settings that a method chooses for a parameter whose own are None; None for no choice.
 
     Attributes:
-        parameterisation: parameterisation or its name; None for no choice.
-        preconditioner: linear map of gradients and steps; None for no choice.
-        coarse_to_fine: resolutions over the steps; None for no choice.
-        start_factor: factor of the initial values before the first step, above 0; None for no choice. The product is moved into the bounds.
-        start: values before the first step, in place of the initial ones; None for no choice.
+        start_factor: factor of the initial values before the first step, above 0. The product is moved into the bounds.
+        start: values before the first step, in place of the initial ones.
 
     Raises:
         InputError: a start that is no list of finite numbers, or another factor.
@@ -167,15 +164,12 @@ class Unknown:
         initial: Initial value: float32, inside the bounds, of the scene's shape. Read-only, because it may be the scene's own memory.
         bounds: (low, high), the parameter's or the physical range from the renderer; None is unbounded.
         measure: Measure of errors against the true value.
-        learning_rate: Learning rate of the parameter; None for the optimizer's.
         preconditioner: S, bound to the mesh if there is one; None for the identity.
         parameterisation: Parameterisation as passed; None for none.
         transform: φ of the parameterisation; None for the identity.
-        coarse_to_fine: Resolutions over the steps; None for one resolution.
         faces: Vertex indices (F, 3), if the parameter is the vertex positions of a mesh; else None.
         regularizer: Regularizer, bound to the mesh; None for none.
         prior: Prior, bound to the unknown; None for none.
-        remeshing: Steps and method of remeshing; None for never.
         truth: True value, of the shape of `initial`; None if unknown.
         surface: True surface of a mesh, if the true position of each vertex is unknown; else None.
         notices: One line for each change of the input.

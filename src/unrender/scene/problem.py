@@ -218,10 +218,7 @@ class Problem(ViewLosses):
         return made
 
     def configured(self, settings: Mapping[str, ParameterSettings]) -> Problem:
-        """Return the same problem, where parameters whose own setting is None take these settings.
-
-        Raises `InputError` for a setting that does not suit its parameter.
-        """
+        """Return the problem where parameters whose own setting is None take these. Raises `InputError` for one that does not suit."""
         known = self.renderer.parameters()
         changed = {key: configure(self.unknowns[key], own, known[key]) for key, own in settings.items()}
         return self.with_parts(unknowns={**self.unknowns, **changed})

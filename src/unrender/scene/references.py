@@ -117,10 +117,8 @@ def _rows(picture: Any, pixels: np.ndarray, channels: int) -> np.ndarray:
     return np.asarray(picture).reshape(-1, channels)[pixels]
 
 
-_MEDIAN = 0.6744897501960817
-"""Median of |z| of a standard normal z."""
-_LEAST = 1e-4
-"""Least noise, in units of the picture's root mean square: no picture is exact."""
+_MEDIAN = 0.6744897501960817  # median of |z| of a standard normal z
+_LEAST = 1e-4  # least noise, in units of the picture's root mean square: no picture is exact
 
 
 def standard_deviation(reference: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -14,10 +14,8 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 
-_PATHS_PER_PASS = 1 << 21
-"""Maximum number of paths per pass, within the memory of a small machine."""
-_SELECTED_VIEWS = 4
-"""Maximum number of views that `selected_views` returns."""
+_PATHS_PER_PASS = 1 << 21  # maximum number of paths per pass, within the memory of a small machine
+_SELECTED_VIEWS = 4  # maximum number of views that `selected_views` returns
 MANY_SENSORS = 4
 """Number of sensors from which all views share one kernel: recording one per sensor would take longer than rendering."""
 

@@ -23,8 +23,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.view_worlds import requested_depth
 
 FILE, ARRAYS = "problem.toml", "problem"
-_INLINE = 64
-"""Maximum number of elements of an array that is written into the file itself."""
+_INLINE = 64  # maximum number of elements of an array that is written into the file itself
 
 
 def save(problem: Problem, folder: Path) -> None:

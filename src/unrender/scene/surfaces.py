@@ -11,12 +11,9 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.geometry import weld
 
-_SAMPLES = 2000
-"""Number of sample points on each surface."""
-_NEAR = 8
-"""Number of candidates for the nearest triangle."""
-_SHARP = -0.5
-"""Cosine of the angle between the normals of two adjacent faces below which the surface folds."""
+_SAMPLES = 2000  # number of sample points on each surface
+_NEAR = 8  # number of candidates for the nearest triangle
+_SHARP = -0.5  # cosine of the angle between the normals of two adjacent faces below which the surface folds
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +135,7 @@ def _nearest(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.where((inside & (square > 1e-290))[:, None], projected, best)
 
 
-_CELLS_PER_TRIANGLE = 8
-"""Maximum average number of grid cells per triangle: cells grow until it holds."""
+_CELLS_PER_TRIANGLE = 8  # maximum average number of grid cells per triangle: cells grow until it holds
 
 
 def crossing_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

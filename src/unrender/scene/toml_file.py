@@ -119,11 +119,7 @@ TABLES: dict[str, type[Table]] = {"": _Problem, "parameters": _Parameter, "views
 
 
 def read(path: str | Path, partial: bool = False) -> Problem:
-    """Return the problem of a TOML file; `partial` as for `Problem`.
-
-    Raises:
-        InputError: "problem.toml:12: parameters[0].bounds: ...": file, line, field and the expected value.
-    """
+    """Return the problem of a TOML file. Raises `InputError`, "problem.toml:12: parameters[0].bounds: ...", with the expected value."""
     file = Path(path)
     model, text = _read_model(file)
     try:

@@ -72,10 +72,7 @@ class Upsamplable(Protocol):
     """A state that can be interpolated to a finer resolution."""
 
     def upsampled(self, upsampler: Upsampler) -> Any:
-        """Return the state at the finer resolution; itself if nothing in it has a parameter's shape.
-
-        Raises `NotCarried` if it cannot be interpolated.
-        """
+        """Return the state at the finer resolution; itself without a parameter's shape. Raises `NotCarried` if that is impossible."""
         ...
 
 

@@ -35,8 +35,7 @@ from unrender.scene.prior import Prior
 _RATIOS = "pictures show only the ratios of its values; the result has the initial length, errors are up to a factor"
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
-_SHORTEST_NORMAL = 0.1
-"""Length of a normal map's vector below which its direction is arbitrary; it should be 1."""
+_SHORTEST_NORMAL = 0.1  # length of a normal map's vector below which its direction is arbitrary; it should be 1
 
 
 @runtime_checkable
@@ -321,10 +320,7 @@ def check_truth(
 
 
 def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
-    """Return the renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a renderer.
-
-    `keys` are the parameters that will be used. Raises `FieldError`.
-    """
+    """Return the renderer of a scene, as for `Problem`. `keys` are the parameters that will be used. Raises `FieldError`."""
     if isinstance(scene, _Renderer) and not isinstance(scene, type):
         return scene
     loaded = type(scene).__module__.partition(".")[0] == "mitsuba"

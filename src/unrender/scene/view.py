@@ -48,11 +48,7 @@ class View:
         return self.known is not None or self.scene is not None or self.aov is not None
 
     def pixel_weights(self, size: int | tuple[int, int] | None = None) -> np.ndarray:
-        """Return the factor of each pixel's loss: the mask (H, W) of a loaded view, or ones.
-
-        Args:
-            size: shape of the ones; None for the reference's.
-        """
+        """Return the factor of each pixel's loss: the mask (H, W) of a loaded view, or ones of `size`, by default the reference's."""
         if self.mask is not None:
             return np.asarray(self.mask)
         return np.ones(np.asarray(self.reference).shape[:2] if size is None else size)

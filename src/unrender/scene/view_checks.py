@@ -38,14 +38,12 @@ from unrender.scene.references import ON_DEVICE
 from unrender.scene.validation import is_number
 from unrender.scene.view import View
 
-_DARKEST = -1e-4
-"""Ratio to the largest value above which negative values count as rounding error."""
+_DARKEST = -1e-4  # ratio to the largest value above which negative values count as rounding error
 
 _MOST_COLOUR = 0.05
 """Largest difference of a mask's channels, which compression may leave; also the largest relative one of an alpha that is no mask."""
 
-_WHITES = 255, 65535
-"""White in 8 and 16 bits. A mask whose largest value is the inverse of one was stored as ones."""
+_WHITES = 255, 65535  # White in 8 and 16 bits. A mask whose largest value is the inverse of one was stored as ones.
 
 
 @dataclass(frozen=True)
@@ -165,8 +163,7 @@ def _check_not_negative(values: np.ndarray) -> None:
     images.refuse_pixels(bad, "negative", f", but radiance is not; {advice}")
 
 
-_WHITE = 0.001
-"""Fraction of saturated pixels from which a notice is given."""
+_WHITE = 0.001  # fraction of saturated pixels from which a notice is given
 
 
 def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
@@ -252,10 +249,7 @@ def _check_view(
 
 
 def _read_mask(source: Any, height: int, width: int) -> tuple[np.ndarray, list[str]]:
-    """Return a mask (H, W) from a file or an array, and notices.
-
-    Raises `InputError` for colours, and values outside [0, 1] or 0 everywhere.
-    """
+    """Return a mask (H, W), and notices. Raises `InputError` for colours, and for values outside [0, 1] or 0 everywhere."""
     mask, notices = _unscaled(source)
     images.check_metadata(source)
     _check_size(mask, height, width, source)

@@ -85,8 +85,7 @@ def normal_equations(
     return 0.5 * (matrix + matrix.T), 0.5 * (one @ r_other + other @ r_one)
 
 
-_ERRORS = 3.0
-"""Standard errors by which the diagonal must exceed 0, and the overlap of all cells that of neighbours."""
+_ERRORS = 3.0  # standard errors by which the diagonal must exceed 0, and the overlap of all cells that of neighbours
 
 
 def overlap(stored: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:

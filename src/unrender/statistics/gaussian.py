@@ -71,10 +71,7 @@ def curvature_distribution(z: np.ndarray) -> np.ndarray:
 
 
 def curvature_sample(u: np.ndarray) -> np.ndarray:
-    """Return the inverse of `curvature_distribution` at u in (0, 1), by linear interpolation of 20 001 values on [−10, 10].
-
-    It has no closed form.
-    """
+    """Return the inverse of `curvature_distribution` at u in (0, 1), which has no closed form, from 20 001 values on [−10, 10]."""
     z, distribution = _table()
     return np.interp(u, distribution, z)
 

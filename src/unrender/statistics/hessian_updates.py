@@ -20,10 +20,7 @@ RIDGE = 0.01
 
 
 def symmetric(matrix: np.ndarray, v: np.ndarray, product: np.ndarray, rate: float) -> np.ndarray:
-    """Return the symmetric B (n, n) moved by the fraction `rate` in (0, 1] toward the nearest symmetric matrix with B v = `product`.
-
-    v is a unit vector (n,).
-    """
+    """Return the symmetric B (n, n) moved by `rate` in (0, 1] towards the nearest symmetric one with B v = `product`, v a unit vector."""
     missing = product - matrix @ v
     update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
     return matrix + rate * update

@@ -251,10 +251,7 @@ def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
 
 
 def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool, max_weight: float) -> Array:
-    """Return α of this step: 0 at the first step, otherwise at most `max_weight`.
-
-    Eq. 17 bounds α where all samples were zero, and everywhere if `clip` is true.
-    """
+    """Return α: 0 at the first step, else at most `max_weight` and, where all samples were zero or with `clip`, the bound of Eq. 17."""
     bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
     alpha = arrays.where(var_f > 0.0, alpha, bound)
     return arrays.minimum(arrays.minimum(alpha, bound) if clip else alpha, max_weight) * started

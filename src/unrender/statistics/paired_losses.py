@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_TILES, _ROBUST = 48, 1.8
-"""Maximum number of tiles of an image; maximum ratio of the sharp score to the robust one."""
+_TILES, _ROBUST = 48, 1.8  # maximum number of tiles of an image; maximum ratio of the sharp score to the robust one
 DISTANCE = 2
 """Distance of the pixels of a pair; a reconstruction filter correlates the references' noise in adjacent pixels."""
 _OF_FILTER, _OF_PRODUCTS = 0.03, 1.25

@@ -32,10 +32,7 @@ class NormalDistribution(ABC):
 
     @abstractmethod
     def parts(self, u: Array) -> tuple[Array, Array]:
-        """Sample t of an inner and of an outer normal in proportion to |∂D/∂α| cosθ, from one uniform number u in (0, 1].
-
-        Both are near 1 for u near 1.
-        """
+        """Sample t of an inner and an outer normal in proportion to |∂D/∂α| cosθ from u in (0, 1]; both are near 1 for u near 1."""
 
     def share(self, t: Array) -> Array:
         """Return |∂ log D / ∂α| / mass, which is independent of α. Times D cosθ it is the density of `parts` for either part."""

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-_MOST_LEVERAGE = 0.9
-"""Largest leverage of a pixel; noise of the slopes may make it larger."""
-_LEAST_LEVERAGE = 1e-3
-"""Norm of the leverages of a pixel up to which its residual is left as it is."""
-_LEAST_CURVATURE = 1e-3
-"""Smallest eigenvalue of a Hessian, relative to the largest, along which pixels have leverage."""
-_AGREE_ERRORS = 3.0
-"""Standard errors from which on neighbours share their noise."""
+_MOST_LEVERAGE = 0.9  # largest leverage of a pixel; noise of the slopes may make it larger
+_LEAST_LEVERAGE = 1e-3  # norm of the leverages of a pixel up to which its residual is left as it is
+_LEAST_CURVATURE = 1e-3  # smallest eigenvalue of a Hessian, relative to the largest, along which pixels have leverage
+_AGREE_ERRORS = 3.0  # standard errors from which on neighbours share their noise
 _FEWEST_PIXELS = 256
 """Number of pixels below which neighbours count as independent: their sums would cover too much of the image."""
 
@@ -81,10 +77,7 @@ def without_own_pixel(
 
 
 def positive_inverse(matrix: np.ndarray, least: float = _LEAST_CURVATURE) -> np.ndarray:
-    """Return the pseudo-inverse of a symmetric matrix, (n, n).
-
-    The matrix is scaled to unit diagonal. Eigenvalues of at most `least` times the largest then count as 0.
-    """
+    """Return the pseudo-inverse of a symmetric matrix scaled to unit diagonal; eigenvalues up to `least` of the largest are 0."""
     scales, eigenvalues, vectors = scaled_eigh(matrix)
     used = eigenvalues > least * eigenvalues[-1]
     inverse = np.divide(1.0, eigenvalues, out=np.zeros_like(eigenvalues), where=used)

@@ -10,10 +10,8 @@ _STARTS = np.arange(1, 11) / 20
 """First values of the windows, as fractions of the sequence. Each window has half of the sequence at least."""
 _FEWEST, _CROSSINGS = 16, 4
 """Number of values of a window, and number of times that they cross their mean, below which drift and noise look alike."""
-_FEW = 4.0
-"""Length of a window relative to its correlation time up to which it shows no mean."""
-_DIFFERENT = 2.0
-"""Standard errors between the means of two parts of a window from which it is not stationary."""
+_FEW = 4.0  # length of a window relative to its correlation time up to which it shows no mean
+_DIFFERENT = 2.0  # standard errors between the means of two parts of a window from which it is not stationary
 _CROSSING_TIMES = 4
 """Largest lag of the autocovariances that are summed, in units of the lag at which they first reach 0."""
 _LOST, _LARGEST_LOSS = 1.25, 0.7
@@ -27,8 +25,6 @@ class StationaryMean:
 
     Attributes:
         start: index of its first value.
-        value: mean.
-        error: standard error.
     """
 
     start: int

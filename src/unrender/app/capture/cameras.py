@@ -88,10 +88,7 @@ class Lens:
 
 
 def project(lens: Lens, camera_to_world: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points: return positions (N, 2) in pixels, and depths (N,) along the view, positive in front of the camera.
-
-    Positions of points behind the camera are undefined.
-    """
+    """Return positions (N, 2) in pixels and depths (N,) in front of the camera of world points. Positions behind it are undefined."""
     local = (np.asarray(points, float) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
     depth = -local[:, 2]
     safe = np.where(depth > 0, depth, 1.0)

@@ -59,7 +59,6 @@ class StoredViews:
             self.append(view)
 
     def append(self, view: CapturedView) -> None:
-        """Store one more view."""
         add = self._store.add
         mask = None if view.mask is None else add(view.mask)
         bare = replace(view, values=_NONE, mask=None, shown=_NONE)
@@ -77,7 +76,6 @@ class StoredViews:
 
     @property
     def masked(self) -> list[bool]:
-        """True if each view has a mask."""
         return [mask is not None for _, _, mask, _ in self._views]
 
     def __len__(self) -> int:

@@ -29,16 +29,14 @@ GRIDS, EXTINCTION, LIGHT = "grids", "grids/extinction.vol", "grids/light.exr"
 _HARMONICS = ["emission", *(f"{COEFFICIENT}{k}" for k in range(1, 9))]
 OWN = frozenset({writing.PROBLEM, HELD_OUT, writing.SCENE, writing.REFERENCES, writing.MASKS, GRIDS, stages_file.FILE})
 """Names that `write` creates in a folder."""
-_FIELD = "field"
-"""Id of the medium in the scene."""
+_FIELD = "field"  # id of the medium in the scene
 _KEYS = {
     "extinction": f"{_FIELD}.sigma_t.data",
     **{name: f"{_FIELD}.{name}.data" for name in _HARMONICS},
     "light": "light.data",
     "exposure": EXPOSURE,
 }
-_DEPTH = 0.5
-"""Initial optical depth through the cube, which transmits more than half of the light."""
+_DEPTH = 0.5  # initial optical depth through the cube, which transmits more than half of the light
 _RATES = {"extinction": 0.1, "light": 0.04, "emission": 0.04, **dict.fromkeys(_HARMONICS[1:], 0.01)}
 """Initial learning rates: of the logarithm of extinction, and of the others relative to the photographs' mean."""
 _LOGARITHM = {"bounds": [0.0, math.inf], "parameterisation": "log"}

@@ -20,11 +20,9 @@ from unrender.core.errors import InputError
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 
 _COARSE = 32
-_REFINED = 4
-"""Number of fine voxels per coarse voxel along each axis."""
+_REFINED = 4  # number of fine voxels per coarse voxel along each axis
 _CHUNK = 1 << 17
-_UNKNOWN = 1e4
-"""Distance in pixels where a photograph gives no information."""
+_UNKNOWN = 1e4  # distance in pixels where a photograph gives no information
 _CRUMBS = 0.02
 _SMOOTHING = 10
 
@@ -176,8 +174,7 @@ def _refined(
 
 SUFFICIENT = 0.6
 """Mean intersection over union of silhouettes and masks below which an import is refused."""
-_CLEAR = 0.15
-"""Minimum increase of the overlap by which another convention is named."""
+_CLEAR = 0.15  # minimum increase of the overlap by which another convention is named
 _VIEWS = 10
 _VOXELS = 40
 _SCALES = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)

@@ -135,7 +135,6 @@ class Imported:
     """The result of an import.
 
     Attributes:
-        folder: the new folder.
         kind: format of the capture.
         views: number of training views.
         size: width and height of the largest view.

@@ -148,10 +148,8 @@ def ply(mesh: Mesh) -> bytes:
     return mesh_files.ply_of([("xyz", mesh.vertices), (("nx", "ny", "nz"), shading_normals(mesh)), *uv], mesh.faces)
 
 
-_SECONDS = 120.0
-"""Time limit of an atlas in seconds; 10 000 faces take 2 seconds, 20 000 faces 15."""
-_PADDING = 3
-"""Texels between charts, before the atlas is scaled down slightly."""
+_SECONDS = 120.0  # time limit of an atlas in seconds; 10 000 faces take 2 seconds, 20 000 faces 15
+_PADDING = 3  # texels between charts, before the atlas is scaled down slightly
 _COMMAND = (sys.executable, "-m", "unrender.app.capture.mesh")
 
 

@@ -32,8 +32,7 @@ from unrender.io import images
 from unrender.losses.metrics import srgb
 from unrender.rendering.exposure import EXPOSURE
 
-_SHADOW = 0.1
-"""Fraction of a pixel's maximum brightness below which it may be in shadow."""
+_SHADOW = 0.1  # fraction of a pixel's maximum brightness below which it may be in shadow
 _WHITE = 0.97
 _CLEARER = 0.9
 """Maximum ratio of the residuals of stored and of decoded values at which the stored values are treated as linear."""
@@ -157,8 +156,7 @@ _KEYS = {
     "normal": "plate.bsdf.normalmap.data",
     "exposure": EXPOSURE,
 }
-_BRIGHTEST = 0.8
-"""Reflectance of the 99th percentile of brightness."""
+_BRIGHTEST = 0.8  # reflectance of the 99th percentile of brightness
 _DISTANCE = 100.0
 """Distance of the camera in half plate widths: nearly orthographic, with a sensor that recorded kernels support."""
 

@@ -34,8 +34,7 @@ _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 1}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
-_LONGEST_SIDE = 1 << 15
-"""Exclusive limit of a side in pixels, set by OpenCV's `remap`."""
+_LONGEST_SIDE = 1 << 15  # exclusive limit of a side in pixels, set by OpenCV's `remap`
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
 
@@ -223,8 +222,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise InputError(f"{path}: {width} x {height} pixels, expected {limits}")
 
 
-_LEAST, _MOST = 1.0, 4.0
-"""Range of exponents. Those of cameras and screens are between 1 and 2.6."""
+_LEAST, _MOST = 1.0, 4.0  # Range of exponents. Those of cameras and screens are between 1 and 2.6.
 
 
 def check_response(response: str) -> str:

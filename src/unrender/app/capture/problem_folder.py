@@ -31,8 +31,7 @@ OWN = frozenset({writing.PROBLEM, HELD_OUT, writing.SCENE, MESH, stages_file.FIL
 _LIGHT_SIZE = 16, 32
 _MAX_DEPTH = 3
 _BAND_WEIGHT = 0.1
-_WHITE = 0.95
-"""Minimum linear value of a saturated pixel, below 1 since resizing averages neighbours."""
+_WHITE = 0.95  # minimum linear value of a saturated pixel, below 1 since resizing averages neighbours
 
 
 def write(
@@ -163,7 +162,6 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
 
 
 def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
-    """Return the sensor of a view as a scene element."""
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
     writing.add_value(sensor, "string", "fov_axis", "x")

@@ -68,8 +68,7 @@ def overlap(silhouettes: Silhouettes, views: CapturedViews) -> list[float]:
 
 LEGEND = "orange: the mesh and its edges; blue: the outline of the mask; dimmed: outside the mesh"
 _MESH, _MASK = np.array([1.0, 0.55, 0.05]), np.array([0.1, 0.55, 1.0])
-_SMALLEST = 320
-"""Minimum number of pixels along the shorter side of an overlay."""
+_SMALLEST = 320  # minimum number of pixels along the shorter side of an overlay
 _TINT = 0.3
 _CREASE = math.cos(math.radians(50))
 _LARGEST_SHEET = 48

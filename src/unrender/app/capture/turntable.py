@@ -11,15 +11,12 @@ import numpy as np
 from unrender.app.capture.capture import CapturedViews
 
 _LIKENESS = 0.4
-_BLUR = 1 / 32
-"""Blur relative to the picture's longer side, which tolerates small movements of tripod and crop."""
+_BLUR = 1 / 32  # blur relative to the picture's longer side, which tolerates small movements of tripod and crop
 _FEWEST_PIXELS = 200
 _FEWEST_VIEWS = 4
-_CONTRAST = 0.01
-"""Minimum standard deviation of an informative background, in display values."""
+_CONTRAST = 0.01  # minimum standard deviation of an informative background, in display values
 _ANGLE = np.radians(20)
-_LEVEL = 0.98
-"""Minimum length of the mean axis in camera coordinates: the cameras' elevation is nearly constant."""
+_LEVEL = 0.98  # minimum length of the mean axis in camera coordinates: the cameras' elevation is nearly constant
 
 
 def axis(poses: np.ndarray) -> np.ndarray:

@@ -39,23 +39,18 @@ COLOUR, ROUGHNESS = 0.4, 0.6
 _SMOOTHEST, _SMOOTHEST_WITH_NORMALS = 0.02, 0.25
 """Minimum roughness, without and with normals. If a lobe is narrower than a texel of the light, derivatives by normals, which grow with
 its inverse square, are mostly noise."""
-_METALLIC = 0.1
-"""Initial value, above the bound 0."""
-_FLAT = (0.5, 0.5, 1.0)
-"""Normal map value that does not change the surface normal."""
+_METALLIC = 0.1  # initial value, above the bound 0
+_FLAT = (0.5, 0.5, 1.0)  # normal map value that does not change the surface normal
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 """Strength of the large-steps preconditioner, and initial learning rate of vertices relative to the mesh's diagonal."""
 _COARSER = 4
-_OF_PICTURES = ("exposure", "vignetting", "response")
-"""Unknowns that are optimised in all stages."""
+_OF_PICTURES = ("exposure", "vignetting", "response")  # unknowns that are optimised in all stages
 _NORMALS_RATE, _LATE = 0.01, {"learning_rate": 0.02}
 """Initial learning rate of a normal map, and later rate of `auto` for the others, a fifth of that of the first stages."""
 _DETAIL = {**_LATE, "correlation": 1 / 128}
 """Settings of the last stages: coarse structure has converged, and detail needs gradients with less smoothing."""
-_POSE_RATE = 0.05
-"""Initial learning rate of poses, in degrees and equivalent units."""
-_RESPONSE_RATE = 0.2
-"""Initial learning rate of the response's contrast and brightness."""
+_POSE_RATE = 0.05  # initial learning rate of poses, in degrees and equivalent units
+_RESPONSE_RATE = 0.2  # initial learning rate of the response's contrast and brightness
 
 
 def parse(text: str) -> tuple[str, ...]:

@@ -154,8 +154,7 @@ def _check_masks(masks: Sequence[_Mask]) -> None:
         raise InputError(f"mask of {printable(full[0].name)}: {what}; {many}")
 
 
-_MARGIN = 0.5
-"""Maximum distance in photograph pixels of a position outside the centres of the outermost pixels."""
+_MARGIN = 0.5  # maximum distance in photograph pixels of a position outside the centres of the outermost pixels
 _SAMPLES = 4096
 _SIDE = 8192
 """Maximum side of a tile. OpenCV's `remap` requires sides below 2^15, so larger results are computed in tiles."""

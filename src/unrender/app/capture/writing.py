@@ -62,7 +62,6 @@ def turned_light(rotations: np.ndarray) -> list[dict[str, Any]]:
 
 
 def encoded(scene: Xml.Element) -> bytes:
-    """Return a scene as an XML file."""
     Xml.indent(scene)
     return Xml.tostring(scene, encoding="utf-8", xml_declaration=True) + b"\n"
 

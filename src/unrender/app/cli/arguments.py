@@ -174,10 +174,7 @@ def use_variant(name: str, threads: int | None = None) -> str:
 
 
 def check_file(name: str) -> None:
-    """Raise `InputError` for a problem file that is missing or has invalid fields, before the slow imports.
-
-    Stages and names of the gallery are not checked.
-    """
+    """Raise `InputError` for a problem file, not one of stages, that is missing or has invalid fields, before the slow imports."""
     file = Path(name)
     if file.suffix.lower() != ".toml":
         return

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
 
 DEFAULT_SECONDS = 20.0
-_DEFAULT = ("stock", "auto")
-"""Default methods: the standard Mitsuba loop, and the automatic choice."""
+_DEFAULT = ("stock", "auto")  # default methods: the standard Mitsuba loop, and the automatic choice
 _POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 

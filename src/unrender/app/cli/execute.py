@@ -58,10 +58,7 @@ def execution(
     console: Console,
     progress: Progress,
 ) -> Iterator[dict[str, Any]]:
-    """Print the plan, and yield the arguments of `optimize`. The files of the live page are removed if the block succeeds.
-
-    The run writes a run folder, even if it is interrupted.
-    """
+    """Print the plan and yield the arguments of `optimize`. Remove the files of the live page if the block succeeds."""
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
         console.say(f"{order.method.name}: {line}")
@@ -162,7 +159,6 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
 
 
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
-    """Print a summary of the result."""
     table = columns()
     table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s, without compiling")
     if result.skipped:

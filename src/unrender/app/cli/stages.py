@@ -46,7 +46,6 @@ class StagesRun:
 
     @property
     def options(self) -> RunOptions:
-        """The options at the start of the run."""
         assert self.stages.run is not None
         return self.stages.run
 

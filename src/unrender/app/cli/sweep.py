@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
-_FREE = ("allow_outside", "workers", "insecure", "trials", "threads")
-"""Options that may change when a sweep continues."""
+_FREE = ("allow_outside", "workers", "insecure", "trials", "threads")  # options that may change when a sweep continues
 
 _What = Annotated[str, typer.Argument(metavar="PROBLEM | DIR", help="A problem; or the folder of a sweep to continue.")]
 _MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")]

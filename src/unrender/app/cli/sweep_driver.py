@@ -46,8 +46,7 @@ from unrender.runs.result import TERMINATED as BY_SIGTERM
 from unrender.scene.problem import Problem
 
 _SHOWN = 10
-_MANY = 1e9
-"""Degrees of freedom of a standard error that is known."""
+_MANY = 1e9  # degrees of freedom of a standard error that is known
 
 
 def line(trial: TrialRecord) -> str:

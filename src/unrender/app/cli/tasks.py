@@ -30,8 +30,7 @@ from unrender.runs.progress import Progress
 from unrender.runs.resume import load_run
 from unrender.scene.problem import Problem
 
-_PATIENCE_SECONDS = 30.0
-"""Seconds to wait for a run folder that a dying process still locks."""
+_PATIENCE_SECONDS = 30.0  # seconds to wait for a run folder that a dying process still locks
 _MARK = ".unrender-folder"
 
 

@@ -81,8 +81,7 @@ _COPIES = 8
 """Copies of each parameter in a worker: current, previous, both scenes' own, both gradients, sent and received."""
 _WITH_CONTROL_VARIATE = 24
 """Images per view in the memory of a control variate: itself, its variance and ten statistics, before and after a step."""
-_PLAIN = 4
-"""Other images per view: reference, rendering, loss derivative and mask."""
+_PLAIN = 4  # other images per view: reference, rendering, loss derivative and mask
 _FLOAT = 4
 
 

@@ -30,10 +30,8 @@ from unrender.pixels.uniform import All
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.problem import Problem
 
-_MOST_LOSSES = 5
-"""Maximum number of times that shares may be lost in one step."""
-_PICTURES_EVERY = 25
-"""Interval in steps of images for display."""
+_MOST_LOSSES = 5  # maximum number of times that shares may be lost in one step
+_PICTURES_EVERY = 25  # interval in steps of images for display
 
 
 @dataclass

@@ -62,7 +62,6 @@ class Call:
     Attributes:
         arrays: {number: array} that the worker does not have yet.
         drop_arrays, drop_memories: numbers that the worker may drop.
-        image: the image estimator.
         state: its state; None for one without memory.
         result: number of the memory after this step; None for none.
         replay: whether only this memory is needed.
@@ -104,7 +103,6 @@ class Reply:
         samples: number of paths traced.
         images: {view: (H, W, 3)} if requested.
         info: {name: {view: array}} if requested.
-        seconds: duration.
         paths: results of a pilot for each of the call's pixels.
         draws: statistics of a mini-batch's pixels, in the batch's order; None if not requested.
     """
@@ -124,7 +122,6 @@ class Reply:
 
 
 def payload_bytes(message: Any) -> int:
-    """Return the bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
     if isinstance(message, (Call, Reply, Batch, DrawStatistics)):

@@ -19,16 +19,13 @@ from unrender.runs.folder.state import Packed
 
 _POLL, _PATIENCE, _ANSWER = 1.0, 4.0, 8.0
 """Seconds between polls, without a reply before a worker is pinged, and before a pinged worker must have answered."""
-_START = 60.0
-"""Maximum start time in seconds of all initial workers together, or of one if none is left."""
+_START = 60.0  # maximum start time in seconds of all initial workers together, or of one if none is left
 _LONGEST, _MANY_TIMES = 1800.0, 50.0
 """Maximum duration of a step in seconds, and relative to its usual duration plus a minute, for a worker that answers but hangs."""
-_COMPILING = 3
-"""Number of steps of a share on a new worker until its kernels are compiled."""
+_COMPILING = 3  # number of steps of a share on a new worker until its kernels are compiled
 _LAGGING, _IN_A_ROW, _LEAST = 4.0, 5, 0.05
 """Factor of the others' median, consecutive steps, and minimum seconds from which a worker counts as lagging."""
-_SUCCESSORS = 3
-"""Maximum number of workers that replace lagging ones, since the next worker on a slow machine lags too."""
+_SUCCESSORS = 3  # maximum number of workers that replace lagging ones, since the next worker on a slow machine lags too
 
 
 @dataclass(eq=False)
@@ -57,7 +54,6 @@ class RayHosts:
     is started, to which they move when it is ready. Shares of a lagging actor move to another one.
 
     Args:
-        cluster: a connected cluster.
         blobs: the problem of each share, see `transfer.packed`.
         threads: threads of each worker; None for its share of the processor.
         tell: function that receives one-line messages on events.

@@ -30,7 +30,6 @@ class Recipe:
     """Steps that restore the memory after a step.
 
     Attributes:
-        number: number of the memory.
         base: recipe of the memory before the step; None without memory, or if the result is stored.
         call: call that computes it from `base`; None if it is stored.
         sent: arrays of the call.

@@ -63,10 +63,8 @@ class Judgement:
     Attributes:
         folder: the folder of judge.json, sheet.png, pictures/ and, for a scene with an environment map, environment.png and
             environment.exr.
-        names: names of the photographs.
         measures: measures of the photographs; empty under another light than that of the photographs.
         albedo: errors of the base colour; None if the truth is unknown.
-        notices: notices for the user, one line each.
     """
 
     folder: Path

@@ -21,10 +21,7 @@ HELD_OUT = "held-out.toml"
 
 
 def find(run: Path, problem: Problem) -> Path:
-    """Return held-out.toml in the folder of the problem file of a run, or in that of its stages.
-
-    Raises `InputError` if the file does not exist.
-    """
+    """Return held-out.toml beside the problem file of a run, or of its stages. Raises `InputError` if there is none."""
     staged = stages_file.stage_of(run)
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
     candidate = None if origin is None else Path(origin).parent / HELD_OUT

@@ -32,8 +32,7 @@ BACKGROUNDS = {"light": None, "black": 0.0, "grey": 0.18, "white": 1.0}
 _ANGLE = 35.0
 _MARGIN = 1.05
 _MOST_FRAMES, _LARGEST = 10_000, 4096
-_STANDING = {"EnvironmentMapEmitter", "ConstantBackgroundEmitter"}
-"""Emitters whose light does not turn with the object."""
+_STANDING = {"EnvironmentMapEmitter", "ConstantBackgroundEmitter"}  # emitters whose light does not turn with the object
 
 
 @dataclass(frozen=True)
@@ -231,10 +230,7 @@ def check_video(path: Path, overwrite: bool, rate: float) -> None:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """Write frames (H, W, 3), bytes, of even width and height, at `rate` frames per second, in the order of their arrival.
-
-    Raises `InputError` if the video cannot be written.
-    """
+    """Write frames (H, W, 3), bytes of even sizes, at `rate` per second, as they arrive. Raises `InputError` if that fails."""
     ending = path.suffix.lower()
     if not ending:
         files.remove_leftovers(path.parent, (path.name,))

@@ -132,10 +132,7 @@ OWN = frozenset(name for known in FORMATS.values() for name in known.files)
 
 
 def check(formats: Sequence[str]) -> tuple[str, ...]:
-    """Return the formats to write, with those that they need, each once.
-
-    Raises `InputError` for an unknown format, or a missing package.
-    """
+    """Return the formats to write and those that they need, once each. Raises `InputError` for an unknown one or a missing package."""
     known = (MITSUBA, *FORMATS)
     for name in formats:
         if name not in known:

@@ -23,9 +23,9 @@ from unrender.core.exclusive import exclusive
 from unrender.io import files
 from unrender.rendering.mitsuba import mesh_layout, poses
 from unrender.rendering.mitsuba.description import load, parse
+from unrender.rendering.mitsuba.parameters import from_tensor, to_tensor
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
-from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.photographs import scene_renderer, scene_values
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
@@ -44,16 +44,14 @@ _OWN = {textures.RECORD, textures.TABLE, textures.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
 _POSITIONS = mesh_layout.POSITIONS
 _ROUNDING = 1e-4
-_INVERSE = 5e-3
-"""Largest deviation from 1 of a matrix times its inverse: axes with three digits deviate less."""
+_INVERSE = 5e-3  # largest deviation from 1 of a matrix times its inverse: axes with three digits deviate less
 _INVERSE_OF_MESH = 0.045
 """The same for meshes, rectangles and sensors, to which the inverse matters little. Axes with two digits deviate less.
 
 An axis of (0.58, 0.58, 0.58) changes pictures of them by 0.3 %, textured spheres by 3 % and environment maps by 12 %.
 """
 _OF_MATRIX = ("cube", "obj", "ply", "rectangle", "serialized")
-_Maps = Mapping[str, Mapping[str, np.ndarray]]
-"""{name: {key: array}}, see `textures.write`."""
+_Maps = Mapping[str, Mapping[str, np.ndarray]]  # {name: {key: array}}, see `textures.write`
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,6 @@ class Exported:
 
     Attributes:
         scene: the XML file; None if it was not requested, or for an emissive medium, which plain Mitsuba does not have.
-        notices: notices for the user, one line each.
         renamed: {key: key in the exported scene} of all parameters of the scene whose key differs there.
     """
 

@@ -21,8 +21,7 @@ from unrender.io.volumes import write_grid
 from unrender.losses.metrics import srgb
 
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
-_LARGEST = 64
-"""Limit of the numbers of a parameter that are written as text."""
+_LARGEST = 64  # limit of the numbers of a parameter that are written as text
 
 
 def write(
@@ -34,7 +33,6 @@ def write(
     file. Return a line for each PNG file with clipped values.
 
     Args:
-        parameters: {key: array}.
         related: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or .npy.
     """
     notices: list[str] = []

@@ -114,10 +114,7 @@ class Band:
 
 
 def parameter_error(run: RunFolder, key: str) -> Series | None:
-    """Return the error of a parameter over the run; None if its truth is unknown.
-
-    It ends with the error of the result, which may hold other values than those of the last step.
-    """
+    """Return the error of a parameter over the run, and last that of the result, which may have other values; None without truth."""
     if key not in run.known:
         return None
     history = run.history

@@ -143,10 +143,7 @@ class Comparison:
 
 
 def compare_groups(groups: tuple[Group, ...]) -> Comparison:
-    """Compare methods up to the shortest run's time, and up to the fewest samples.
-
-    Raises `InputError` if no truth is known, and no loss is finite.
-    """
+    """Compare methods up to the shortest time and the fewest samples. Raises `InputError` without truth and without a finite loss."""
     ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
     end = ends["seconds"]
     first_run = groups[0].runs[0]

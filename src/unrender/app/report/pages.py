@@ -215,10 +215,8 @@ MOST_FACES = 200_000
 """Limit of the faces of all meshes of a panel; larger meshes are not shown."""
 _STEPS = (1 << 16) - 1
 """Number of quantisation steps of the positions along each side of the bounding cube of all meshes."""
-_SIZE = 280
-"""Width and height of each mesh in the picture, in pixels."""
-_TURN, _TILT = 0.6, 0.35
-"""Angles of the picture and of the first view, in radians: about the vertical, and downwards."""
+_SIZE = 280  # width and height of each mesh in the picture, in pixels
+_TURN, _TILT = 0.6, 0.35  # angles of the picture and of the first view, in radians: about the vertical, and downwards
 
 
 @dataclass(frozen=True)

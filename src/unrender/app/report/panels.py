@@ -16,8 +16,7 @@ from unrender.losses import metrics
 from unrender.runs.folder.reader import RunFolder, ViewPictures
 from unrender.runs.image_sensitivity import around, insensitive
 
-_TENS = -3.0
-"""The lower end of the colour scale of a sensitivity: log₁₀ of the ratio to the greatest."""
+_TENS = -3.0  # the lower end of the colour scale of a sensitivity: log₁₀ of the ratio to the greatest
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,7 @@ class Panel:
 
 
 def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
-    """Return the panel of a view of one run, whose result is called "Current" while it continues.
-
-    It compares the result with the reference and shows the start, the errors, and the maps of the method (control weight, pixel
-    probability).
-    """
+    """Return the panel of a view of a run ("Current" while it continues): reference, result, start, errors, the method's maps."""
     factor = metrics.exposure(shown.reference, shown.mask)
     what = name.lower()
     error = tone_mapping.absolute_error(shown.result, shown.reference, shown.mask)
@@ -98,10 +93,7 @@ def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> li
 
 
 def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
-    """Return the panel of a view of several methods.
-
-    It compares the result of each method with the reference and shows its error. All methods share one exposure and one error scale.
-    """
+    """Return the panel of a view: the result of each method beside the reference, and its error, on common scales."""
     first = next(iter(shown.values()))
     reference, factor = first.reference, metrics.exposure(first.reference, first.mask)
     errors = {label: tone_mapping.absolute_error(of.result, of.reference, of.mask) for label, of in shown.items()}
@@ -122,10 +114,7 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
 
 
 def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Panel:
-    """Return the panel of a recovered texture or volume, with its sensitivity if it is known.
-
-    The result is compared with the truth, or with the start where the truth is unknown.
-    """
+    """Return the panel of a recovered map beside its truth, or its start if that is unknown, with its sensitivity if known."""
     maps = (run.parameters, run.initial, run.truth, run.sensitivity, run.standard_error, run.data_share)
     known = (of.get(key) for of in maps)
     columns = run.measure(key).repeated
@@ -179,10 +168,7 @@ def maps_of(run: RunFolder, arrays: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray) -> Panel:
-    """Return the panel of a map of several methods.
-
-    It compares the result of each method with the truth and shows its error, on one scale. It shows the middle slice of a volume.
-    """
+    """Return the panel of a map: the result of each method beside the truth, and its error, on one scale; a volume's middle slice."""
     scale = ColourScale(truth)
     label, true_plane = next(iter(pictures.planes(truth).items()))
     planes = {name: pictures.planes(result).get(label) for name, result in results.items()}

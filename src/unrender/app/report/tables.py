@@ -37,10 +37,7 @@ def charts(run: RunFolder, axis: str) -> list[Chart]:
 
 
 def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], axis: str) -> list[Chart]:
-    """Return the charts of several runs, one line per run.
-
-    With several parameters, the error is the mean over the parameters of error / error at the start of the first run.
-    """
+    """Return charts with one line per run. The error of several parameters is the mean relative to the first run's start."""
     ends = [float(getattr(run.history, axis)[-1]) for run in runs.values() if len(run.history)]
     if not ends:
         return []

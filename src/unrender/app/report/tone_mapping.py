@@ -89,10 +89,7 @@ class PictureEncoder:
         return self._picture(PictureData(values, 1.0, low, high, VALUE_COLORMAP), alt)
 
     def error(self, error: np.ndarray, high: float, alt: str) -> Picture:
-        """Encode (H, W) errors from 0 to `high`.
-
-        The colour scale uses the square root of the error, so that a tenth of `high` remains visible.
-        """
+        """Encode (H, W) errors from 0 to `high` by their square root, so that a tenth of `high` remains visible."""
         return self._picture(PictureData(error, 1.0, 0.0, high, ERROR_COLORMAP, True), alt)
 
     def _picture(self, picture: PictureData, alt: str) -> Picture:
@@ -151,10 +148,7 @@ def absolute_error(shown: np.ndarray, reference: np.ndarray, mask: np.ndarray | 
 
 
 def colour_limit(error: np.ndarray) -> float:
-    """Return the upper end of the colour scale of an error.
-
-    It is the 99th percentile of the finite values; their maximum where that is 0; 1 where both are 0 or no value is finite.
-    """
+    """Return the end of an error's colour scale: the 99th percentile of the finite values, else their maximum, else 1."""
     finite = error[np.isfinite(error)]
     if finite.size == 0:
         return 1.0

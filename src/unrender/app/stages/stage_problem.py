@@ -34,7 +34,6 @@ class StagedProblem:
 
     Attributes:
         scene: an XML file.
-        parameters, views, loss, max_depth, truth, name: attributes of `Problem`.
         known: the renderer's description of each unknown.
         initial: {key: array}, initial values that a scene can hold.
         given: the keys of those that the problem's scene does not have.

@@ -164,10 +164,7 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 
 def read(path: str | Path) -> Stages:
-    """Read the stages of a TOML file.
-
-    Raises `InputError`, "stages.toml:12: stages[0].share: ...": the file, the line, the field, the expected value.
-    """
+    """Read a TOML file of stages. Raises `InputError`, "stages.toml:12: stages[0].share: ...", with the expected value."""
     file = Path(path)
     model, content = toml_lines.read(file, _Stages, {"stages": _Stage, "run": _Run})
     known: set[str] = set()
@@ -215,10 +212,7 @@ def write(stages: Stages, folder: Path) -> None:
 
 
 def split(stages: Stages) -> list[tuple[int | None, float | None]]:
-    """Return (steps, seconds) of each stage, in proportion to the shares; None without that budget.
-
-    Every stage has at least one step, so the steps can exceed the total.
-    """
+    """Return (steps, seconds) of each stage by the shares, None without that budget. All have a step, even if the total is exceeded."""
     total = sum(stage.share for stage in stages.stages)
     ends, budgets = 0.0, []
     assigned = 0
@@ -238,10 +232,7 @@ def folder_of(stages: Stages, index: int, out: Path) -> Path:
 
 
 def run_folders(directory: Path) -> list[Path]:
-    """Return the run folders of a folder of stages, including stages that have not started; any other folder is returned alone.
-
-    Raises `InputError` if the file of stages is malformed.
-    """
+    """Return the run folders of a folder of stages, also of those not started; else the folder itself. Raises `InputError`."""
     if not (directory / FILE).is_file():
         return [directory]
     stages = read(directory / FILE)
@@ -251,20 +242,14 @@ def run_folders(directory: Path) -> list[Path]:
 
 
 def last_result(directory: Path) -> Path:
-    """Return the run folder of the last started stage of a folder of stages; any other folder is returned as it is.
-
-    Raises `InputError` if the file of stages is malformed.
-    """
+    """Return the run folder of the last started stage; any other folder is returned as it is. Raises `InputError`."""
     if (directory / schema.RECORD).is_file():
         return directory
     return next((run for run in reversed(run_folders(directory)) if (run / schema.RECORD).is_file()), directory)
 
 
 def stage_of(run: Path) -> tuple[Stages, int] | None:
-    """Return the stages of a run folder and its index among them; None for a folder without stages.
-
-    Raises `InputError` if the file of stages is malformed.
-    """
+    """Return the stages of a run folder and its index among them; None without stages. Raises `InputError`."""
     out, name = run.resolve().parent, run.resolve().name
     if not is_of_run(out / FILE):
         return None

@@ -35,8 +35,6 @@ class SweepPlan(BaseModel):
     Attributes:
         problem, problem_settings: the problem and its settings, as typed.
         method, settings: the method and the settings that all trials share.
-        over: the axes, as typed.
-        search: the search that proposes the settings of trials.
         trials: number of trials; None for all points of a grid.
         seed, seeds: seed of the first run of each trial and of the search; number of runs of a trial, with consecutive seeds.
         steps, seconds: the budget of each run.
@@ -69,13 +67,11 @@ class RunOutcome(BaseModel):
 
     Attributes:
         folder: its run folder, within the folder of the sweep.
-        seed: seed of its random numbers.
         status: the status in the run folder at the end of the run.
         stopped: see `Result.stopped`.
         error, standard_error: see `stated_error`; None if unknown.
         steps, samples, seconds: its work; the seconds are those of the optimisation.
         wall_seconds: duration including compilation and pictures; 0 for a run that existed before the session.
-        message: the error message; "" for none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -99,12 +95,10 @@ class TrialRecord(BaseModel):
     Attributes:
         number: index of the trial, from 0.
         settings: values of the axes.
-        status: "finished" or "failed".
         error: mean over its runs; None for a failed trial.
         standard_error: standard error of the mean, from the spread over runs, or that of a single run; None if unknown.
         runs: its runs, in order of their seeds; fewer than planned in a failed trial.
         attempts: number of attempts: more than one if workers died.
-        message: the error message; "" for none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -130,10 +124,7 @@ class SweepRecord(BaseModel):
     """The content of sweep.json.
 
     Attributes:
-        format: format of the file.
         status: "running", "finished" or "interrupted".
-        command: the command line.
-        plan: the plan of the sweep.
         best: number of the finished trial with the least error; None before a trial has finished.
         best_line: the settings of that trial, as they are typed; "" before a trial has finished.
         wall_seconds: duration of all sessions so far.
@@ -189,10 +180,7 @@ def best_folders(folder: Path, record: SweepRecord, most: int = 1) -> list[Path]
 
 
 def watched_folders(folder: Path) -> list[Path]:
-    """Return the run folders to watch: those of a sweep, or the folder itself if it is no sweep.
-
-    Folders of trials that have not started yet are included, up to `_MOST_WATCHED` folders.
-    """
+    """Return the run folders of a sweep to watch, also future ones, up to `_MOST_WATCHED`; else the folder itself."""
     if not (folder / SWEEP).is_file():
         return [folder]
     try:
@@ -286,7 +274,6 @@ class Trials:
         return None
 
     def end(self, record: TrialRecord) -> None:
-        """Store the record of a trial that has ended."""
         self.ended[record.number] = record
 
     @property

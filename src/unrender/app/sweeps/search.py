@@ -13,8 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.methods.base import Method
 
-_DIGITS = 4
-"""Significant digits of numbers from a range, so that they are short to type."""
+_DIGITS = 4  # significant digits of numbers from a range, so that they are short to type
 _MOST_POINTS = 10_000
 
 
@@ -41,10 +40,7 @@ class Axis:
     integer: bool = False
 
     def at(self, share: float) -> str:
-        """Return the value at a position in [0, 1) along the axis.
-
-        Uniform positions give each choice the same probability, and each integer of a linear range.
-        """
+        """Return the value at a position in [0, 1) of the axis. Choices, and the integers of a linear range, have equal shares."""
         if self.choices:
             return self.choices[min(int(share * len(self.choices)), len(self.choices) - 1)]
         low, high = (self.low - 0.5, self.high + 0.5) if self.integer else (self.low, self.high)

@@ -27,8 +27,7 @@ BACKLOG = 1024
 _STRANGERS = 768
 """Limit of the open connections whose last request did not show the token; one more closes the oldest of them."""
 
-_FILES = 4096
-"""Limit of open files that the server requests from the system."""
+_FILES = 4096  # limit of open files that the server requests from the system
 
 _ADMITTED = "unrender.admitted"
 

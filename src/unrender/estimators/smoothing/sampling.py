@@ -32,12 +32,10 @@ class SamplingOptions:
 Function = Callable[[np.ndarray], np.ndarray]
 """Function from points (B, n) to values (B,)."""
 
-_REPLICATES = 8
-"""Number of independent scramblings of a low-discrepancy sequence, which give its standard error."""
+_REPLICATES = 8  # number of independent scramblings of a low-discrepancy sequence, which give its standard error
 _dropped = DropReport()
 """Dropped perturbations of all functions of this process, since each step creates a `SmoothedFunction`."""
-_ORTHOGONAL = 1 << 20
-"""Stream of random numbers for orthogonal samples."""
+_ORTHOGONAL = 1 << 20  # stream of random numbers for orthogonal samples
 
 
 class SmoothedFunction:

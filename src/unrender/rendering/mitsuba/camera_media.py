@@ -20,14 +20,9 @@ from unrender.rendering.mitsuba.scene_loading import media
 
 _log = logging.getLogger("unrender")
 
-_RAYS = 8
-"""Number of camera rays along each axis of the film."""
-
-_SURFACES = 64
-"""Maximum number of surfaces that a ray passes before the boundary of a medium."""
-
-_MARGIN = 1e-3
-"""Distance of a ray's origin from a bounding box, relative to half of the longest side."""
+_RAYS = 8  # number of camera rays along each axis of the film
+_SURFACES = 64  # maximum number of surfaces that a ray passes before the boundary of a medium
+_MARGIN = 1e-3  # distance of a ray's origin from a bounding box, relative to half of the longest side
 
 _AT_A_POINT = ("PerspectiveCamera", "ThinLensCamera", "RadianceMeter")
 

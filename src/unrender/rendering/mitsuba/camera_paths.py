@@ -128,7 +128,6 @@ class Paths:
     """State of a rendering that `adjoint` needs to replay its paths.
 
     Attributes:
-        request: request of the rendering.
         radiance: radiance per lane (`FilmResponse.stored`).
         radiance_previous: that of the previous state; None unless a pair was rendered.
         space: sample space of the pair.
@@ -146,8 +145,7 @@ class Paths:
     keys: tuple[str, ...] = ()
 
 
-_MOST_PENDING = 64
-"""Maximum number of launches with unread counts, since each reading waits for all launches before it."""
+_MOST_PENDING = 64  # maximum number of launches with unread counts, since each reading waits for all launches before it
 _PENDING_SHARE = 8
 """At most one of so many launches has an unread count, so that short runs report their dropped samples, too."""
 

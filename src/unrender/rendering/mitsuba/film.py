@@ -241,7 +241,6 @@ class ViewWeights:
     """Pixels of one sensor.
 
     Attributes:
-        sensor: index of the sensor.
         image: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; 0 at pixels that were not requested.
         pixels: `mi.UInt32`, flat indices of the requested pixels; one may occur twice.
         values: `mi.Float` (3 N,), weights of these pixels, mean over groups.

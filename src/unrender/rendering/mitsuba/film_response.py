@@ -16,8 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-_STEP = 5.0
-"""Distance in nanometres of the entries of Mitsuba's tables of the CIE 1931 curves."""
+_STEP = 5.0  # distance in nanometres of the entries of Mitsuba's tables of the CIE 1931 curves
 
 
 @dataclass

@@ -23,12 +23,9 @@ from unrender.rendering.renderer import SampleRequest
 
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
 """Sensor classes that declare all members in Mitsuba 3.9."""
-_CURVES = frozenset({"BSplineCurve", "LinearCurve"})
-"""Classes of curves."""
-_MANY = 3
-"""Number of sensors from which on a scene's sensors share recordings."""
-_LONGEST_GAP = 32
-"""Number of consecutive unused registry ids that ends a search. Ids of dead objects are reused."""
+_CURVES = frozenset({"BSplineCurve", "LinearCurve"})  # classes of curves
+_MANY = 3  # number of sensors from which on a scene's sensors share recordings
+_LONGEST_GAP = 32  # Number of consecutive unused registry ids that ends a search. Ids of dead objects are reused.
 
 
 def are_recordable(sensor: Any, several: bool) -> bool:
@@ -102,8 +99,7 @@ def _registered(kind: Any) -> Iterator[Any]:
 
 
 _log = logging.getLogger("unrender")
-_ATTEMPTS = 3
-"""Number of consecutive failures after which a function is traced at every call."""
+_ATTEMPTS = 3  # number of consecutive failures after which a function is traced at every call
 _INDEPENDENT = "the argument does not depend on the input variable"
 """Part of Dr.Jit's error message for a derivative that does not exist."""
 

@@ -17,8 +17,7 @@ from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.parameters import is_mirror_or_glass
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, attribute, has_instances, scene_of
 
-_NEAR = 1e-3
-"""Distance from another shape that counts as contact, relative to the diagonal of the mesh's bounding box."""
+_NEAR = 1e-3  # distance from another shape that counts as contact, relative to the diagonal of the mesh's bounding box
 
 
 def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
@@ -152,8 +151,7 @@ def shadow_notices(scene: Any, keys: Collection[str]) -> list[str]:
 _PAIRS, _APART, _HALVINGS, _JUMP = 4096, 0.02, 16, 0.5
 """Pairs of texture coordinates, their first distance, number of times that the half with the larger difference is taken, and the share of
 the first difference that remains where a texture jumps."""
-_FLAT = 1e-4
-"""First difference, relative to the largest value, up to which a texture is constant but for rounding."""
+_FLAT = 1e-4  # first difference, relative to the largest value, up to which a texture is constant but for rounding
 
 
 def jump_notices(scene: Any, graph: ObjectGraph, keys: Collection[str]) -> list[str]:

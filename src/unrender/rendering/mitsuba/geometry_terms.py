@@ -29,8 +29,7 @@ from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
-_STREAM = 3
-"""Stream of a request's key, whose random numbers are independent of its paths."""
+_STREAM = 3  # stream of a request's key, whose random numbers are independent of its paths
 
 
 def moved_shape(scene: LoadedScene, key: str) -> str:

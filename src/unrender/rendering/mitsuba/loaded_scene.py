@@ -27,12 +27,11 @@ from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import spectral_colours
 from unrender.rendering.mitsuba.edges import meshed
 from unrender.rendering.mitsuba.frozen import FrozenFunction, build_distributions
-from unrender.rendering.mitsuba.parameters import is_one_direction, normals_key
+from unrender.rendering.mitsuba.parameters import from_tensor, is_one_direction, native_shape, normals_key, to_tensor
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, refusal, replace_meshes
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
-from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.mitsuba.turned_lights import with_turns
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.rendering.turns import Turns
@@ -130,14 +129,11 @@ class LoadedScene:
     """One load of a scene description. It owns its state, except for a scene object that the user has loaded and may change as well.
 
     Args:
-        description: what to load.
         moving: ids of shapes that move; spheres among them become meshes.
         replaced: {id of a shape: its new mesh}.
         turns: rotations of its lights for each sensor; None for the scene as described.
 
     Attributes:
-        scene: the `mitsuba.Scene`.
-        variant: Mitsuba's variant that it was loaded in.
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps.
         equal: names of objects, by sets of equal ones (`equal_objects`).
         meshed: ids of spheres that became meshes.
@@ -309,7 +305,6 @@ class LoadedScene:
             self.set_parameters({key: setting.value for key, setting in self._settings.items()})
 
     def clear_gradients(self) -> None:
-        """Clear the gradients of all leaves."""
         for leaf in self.leaves.values():
             dr.clear_grad(leaf)
 

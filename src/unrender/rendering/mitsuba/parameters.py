@@ -1,4 +1,7 @@
-"""Effect of a parameter on the image, derived from the scene graph."""
+"""Effect of a parameter on the image, derived from the scene graph, and conversion of Mitsuba values to tensors.
+
+The tensor of a number is (), of a colour (3,), of a bitmap (H, W, C), of a grid (Z, Y, X, C).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,9 @@ from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from unrender.core import arrays
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.mesh_layout import FACES, NORMALS, POSITIONS, TEXCOORDS
@@ -221,11 +226,7 @@ def is_one_direction(key: str, value: Any) -> bool:
 
 
 def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Role:
-    """Return the meaning of a parameter's values.
-
-    Args:
-        shape: shape of its array.
-    """
+    """Return the meaning of a parameter's values."""
     vectors = math.prod(shape) % 3 == 0 if len(shape) == 1 else bool(shape) and shape[-1] == 3
     names, node = key.split("."), parameters.properties[key][2]
     if vectors and names[-1] in _DIRECTIONS:
@@ -276,3 +277,47 @@ def normals_key(key: str) -> str:
     """Return the key of the normals that Mitsuba recomputes when the parameter `key` changes; "" if there are none."""
     owner, _, name = key.rpartition(".")
     return f"{owner}.{NORMALS}" if name == POSITIONS else ""
+
+
+def tensor(values: np.ndarray) -> mi.TensorXf:
+    """Return a tensor of these values in its own memory."""
+    return mi.TensorXf(arrays.owned(values, mi.Float), np.shape(values))
+
+
+def native_shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of the tensor for a Mitsuba value. Raise `TypeError` for a value that is not an array."""
+    if isinstance(value, (int, float)):
+        return ()
+    if not dr.is_array_v(value) or dr.is_matrix_v(value) or dr.is_special_v(value):
+        raise TypeError(type(value).__name__)
+    if dr.is_tensor_v(value):
+        return tuple(value.shape)
+    if dr.depth_v(value) == 1:
+        return () if len(value) == 1 else (len(value),)
+    if dr.depth_v(value) == 2 and dr.width(value) == 1:
+        return (len(value),)
+    raise TypeError(type(value).__name__)
+
+
+def to_tensor(value: Any) -> mi.TensorXf:
+    """Return the tensor (`mi.TensorXf`, detached) for a Mitsuba value."""
+    shape = native_shape(value)
+    if isinstance(value, (int, float)):
+        return mi.TensorXf(np.float32(value))  # pyright: ignore[reportArgumentType]
+    if dr.is_tensor_v(value):
+        return mi.TensorXf(dr.detach(value))
+    return mi.TensorXf(dr.ravel(dr.detach(value)), shape)  # pyright: ignore[reportArgumentType]
+
+
+def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
+    """Return the Mitsuba value of the type of `like` for a tensor; the inverse of `to_tensor`."""
+    if dr.is_tensor_v(like):
+        return type(like)(tensor.array, tuple(tensor.shape))
+    if dr.depth_v(like) == 1:
+        return type(like)(tensor.array)
+    return dr.unravel(type(like), type(like[0])(tensor.array))
+
+
+def is_broadcast(values: np.ndarray) -> bool:
+    """Return whether an array has one state, or repeats one along its first axis without copies. Values are not compared."""
+    return len(values) == 1 or np.asarray(values).strides[0] == 0

@@ -20,10 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-_BINS = 4096
-"""Number of bins of equal probability, for each distance from the borders of the crop window."""
-_CELLS = 1 << 14
-"""Number of cells in which a filter is tabulated."""
+_BINS = 4096  # number of bins of equal probability, for each distance from the borders of the crop window
+_CELLS = 1 << 14  # number of cells in which a filter is tabulated
 
 
 def is_box(film: Any) -> bool:
@@ -182,8 +180,7 @@ def _slopes(rfilter: Any, below: int, above: int, reach: int) -> tuple[np.ndarra
     return nodes[0], nodes[1][::-1], mass
 
 
-_integrals: dict[_Kind, list[float]] = {}
-"""Cached integrals of pixel filters, by their distances from the borders."""
+_integrals: dict[_Kind, list[float]] = {}  # cached integrals of pixel filters, by their distances from the borders
 
 
 class FilterStencil:

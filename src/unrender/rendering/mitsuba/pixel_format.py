@@ -21,8 +21,7 @@ from unrender.rendering.renderer import Rendering, SampleRequest
 from unrender.rendering.wrapper import SessionWrapper
 
 _COLOURS = {"y": "luminance", "ya": "luminance", "xyz": "xyz", "xyza": "xyz"}
-_WEIGHTS = (0.212671, 0.715160, 0.072169)
-"""Weights of red, green and blue in `mitsuba.luminance`."""
+_WEIGHTS = (0.212671, 0.715160, 0.072169)  # weights of red, green and blue in `mitsuba.luminance`
 
 
 def formats(sensors: Sequence[Any]) -> list[PictureFormat]:

@@ -76,7 +76,6 @@ class PoseKey:
 
 
 def keys(scene: Any) -> dict[str, PoseKey]:
-    """Return the pose parameters of a scene by key."""
     targets = [
         (shape.id(), (*_MOTIONS, "scale"), shape.is_emitter()) for shape in scene.shapes() if not shape.is_sensor()
     ]
@@ -217,7 +216,6 @@ class PosedScene:
     """A scene with posed shapes and sensors, built once for any poses.
 
     Args:
-        scene: the loaded scene.
         chosen: {key: its meaning} of the parameters in use.
         attributed: ids of shapes whose materials read attributes of vertices.
 

@@ -31,6 +31,7 @@ from unrender.rendering.mitsuba.geometry_terms import (
 )
 from unrender.rendering.mitsuba.light_paths import LightPaths, mask_notices, null_notices
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.parameters import tensor
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.rigid_motions import lengths
@@ -38,7 +39,6 @@ from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, merge_notices
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
-from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.picture_format import PictureFormat
 from unrender.rendering.renderer import (
     Camera,
@@ -69,7 +69,6 @@ class MitsubaRenderer:
     other than meshes have no path gradient.
 
     Attributes:
-        light_paths: settings of the light paths.
         joins_views: whether requests may have the seeds of several views.
         max_depth: maximum path length in segments.
         requested_depth: the argument `max_depth`.
@@ -224,10 +223,8 @@ class MitsubaRenderer:
         return self._differential
 
     def with_aov(self, name: str) -> MitsubaRenderer:
-        """Return a renderer of the same loaded scenes with an AOV in place of radiance.
-
-        Raises `InputError` for scenes with media, and in spectral variants.
-        """
+        """Return a renderer of the same scenes with an AOV in place of radiance. Raises `InputError` with media and in spectral
+        variants."""
         if self.pair.volumetric:
             raise InputError(f"{name} is a property of surfaces, and the scene has media; leave it out")
         if is_spectral():

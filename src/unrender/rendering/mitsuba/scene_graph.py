@@ -29,9 +29,6 @@ _ATTRIBUTE = re.compile(r'name = "(.*)",\s+scale = "(.*)"')
 class ObjectGraph:
     """All objects of a scene.
 
-    Args:
-        scene: a loaded scene.
-
     Attributes:
         nodes: every object once. Two loads of a description have the same order.
         owners: {object: its holders}, in the order of visits; the scene has none.
@@ -260,8 +257,7 @@ Holders = Mapping[Any, list[tuple[Any, str]]]
 
 _SPECTRAL_ONLY = {"RegularSpectrum": "regular", "IrregularSpectrum": "irregular", "BlackBodySpectrum": "blackbody"}
 """{class: plugin} of plugins that Mitsuba loads in RGB variants but cannot evaluate there."""
-_TIMED_SKY = "TimedSunskyEmitter"
-"""Class of an emitter that Mitsuba loads but cannot evaluate in loops, in any variant."""
+_TIMED_SKY = "TimedSunskyEmitter"  # class of an emitter that Mitsuba loads but cannot evaluate in loops, in any variant
 _PRIMITIVE_FIELD = "BasicVolumetricPrimitiveRadianceFieldIntegrator"
 
 

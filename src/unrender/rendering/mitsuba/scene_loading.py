@@ -35,10 +35,7 @@ The function is called twice, so that ready-made objects such as meshes are crea
 
 
 def load(description: SceneDescription) -> mi.Scene:
-    """Return a Mitsuba scene. Meshes are not merged, so two loads have their shapes in the same order.
-
-    Raises `InputError` in one line if the file is missing or Mitsuba refuses the description.
-    """
+    """Return a Mitsuba scene, without merged meshes: two loads have their shapes in one order. Raises `InputError` in one line."""
     return load_resolved(description)[0]
 
 

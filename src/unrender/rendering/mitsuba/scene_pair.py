@@ -31,6 +31,7 @@ from unrender.rendering.mitsuba.parameters import (
     brightness,
     is_nonlinear,
     is_of_vertices,
+    native_shape,
     parameter_traits,
     role,
     transform_obstacle,
@@ -47,7 +48,6 @@ from unrender.rendering.mitsuba.scene_loading import (
     is_loaded,
     media,
 )
-from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleRequest
 from unrender.rendering.turns import Turns
 
@@ -301,7 +301,6 @@ class ScenePair:
         return all(emissive.is_positive(medium) for medium in media(self.current))
 
     def parameter_traits(self, key: str) -> ParameterTraits:
-        """Return the traits of the parameter `key`."""
         traits = self._traits(key)
         if self.volumetric and traits.geometric:
             return replace(traits, reason=f"{traits.reason}, in a scene with media", replayable=False)

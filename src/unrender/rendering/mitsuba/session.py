@@ -33,6 +33,7 @@ from unrender.rendering.mitsuba.integrators.path import PathPair, PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses
+from unrender.rendering.mitsuba.parameters import is_broadcast, tensor
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
@@ -49,11 +50,9 @@ from unrender.rendering.mitsuba.passes import (
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
-from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
 
-_LANES = 1 << 22
-"""Maximum number of paths per launch of a batch, which fits a small machine's memory."""
+_LANES = 1 << 22  # maximum number of paths per launch of a batch, which fits a small machine's memory
 
 
 class MitsubaSession:

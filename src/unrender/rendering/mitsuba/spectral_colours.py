@@ -21,14 +21,13 @@ import numpy as np
 from unrender.rendering.mitsuba.film_response import is_spectral, table_wavelengths
 from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.mesh_layout import NORMALS, POSITIONS
+from unrender.rendering.mitsuba.parameters import tensor
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.scene_graph import Holders, children, class_name
-from unrender.rendering.mitsuba.tensors import tensor
 
 _DARKEST, _BRIGHTEST = 1e-4, 1 - 1e-4
 """Range of grey, and smallest value of the largest channel of a colour. Coefficients of black and white are infinite, without slopes."""
-_LARGEST_FIRST = 0.02
-"""Size that the first coefficient of no colour has; the largest is .005."""
+_LARGEST_FIRST = 0.02  # size that the first coefficient of no colour has; the largest is .005
 _RAW = re.compile(r"^\s*raw = (1|true)\b", re.MULTILINE)
 _RGB_TEXTURES = {"BitmapTextureImpl": "data", "SRGBReflectanceSpectrum": "value"}
 _DIRECT = {"RegularSpectrum": "values", "IrregularSpectrum": "values", "UniformSpectrum": "value"}
@@ -37,10 +36,8 @@ _NUMBERS = ("normalmap", "nested_texture", "opacity", "weight", "roughness", "al
 """Slots that may read a colour bitmap without making spectra of it."""
 _FILMS = ("HDRFilm",)
 _INSTEAD = "give the colour as a regular spectrum, whose values can be recovered"
-_ROWS = 1 << 14
-"""Number of colours that are converted at once."""
-_Ends = tuple[Any, Any]
-"""Weights of the two ends of a cell along an axis."""
+_ROWS = 1 << 14  # number of colours that are converted at once
+_Ends = tuple[Any, Any]  # weights of the two ends of a cell along an axis
 
 
 def channels(value: Any) -> int:

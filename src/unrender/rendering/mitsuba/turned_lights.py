@@ -20,10 +20,8 @@ from unrender.rendering.mitsuba.scene_graph import scene_of
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, load_sensors
 from unrender.rendering.turns import Turns
 
-_DISTANT = {"DirectionalEmitter", "EnvironmentMapEmitter"}
-"""Classes of emitters that can be turned."""
-_FAR = 1e4
-"""Distance of the light for shadow rays, relative to the size of the scene."""
+_DISTANT = {"DirectionalEmitter", "EnvironmentMapEmitter"}  # classes of emitters that can be turned
+_FAR = 1e4  # distance of the light for shadow rays, relative to the size of the scene
 
 
 def turnable(scene: Any) -> tuple[str, ...]:

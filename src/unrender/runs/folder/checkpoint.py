@@ -51,10 +51,7 @@ def write(
     problem: Mapping[str, str],
     keep: int = KEEP,
 ) -> Path:
-    """Write a checkpoint of the run folder `folder`, then remove all but the last `keep`.
-
-    Raises `OSError` if that fails, and leaves earlier checkpoints unchanged.
-    """
+    """Write a checkpoint of the run folder, then remove all but the last `keep`. Raises `OSError`, and leaves earlier ones unchanged."""
     root = folder / FOLDER
     partial, final = root / f".{step:08d}.{os.getpid()}.{files.PARTIAL}", root / f"{step:08d}"
     data = safetensors.numpy.save(packed.tensors)

@@ -19,8 +19,7 @@ from unrender.runs.image_sensitivity import MAP_AXES
 if TYPE_CHECKING:
     from unrender.runs.result import Result
 
-_ALWAYS = (schema.PARAMETERS, schema.INITIAL)
-"""Archives that exist even without arrays."""
+_ALWAYS = (schema.PARAMETERS, schema.INITIAL)  # archives that exist even without arrays
 _COPIED = (
     *("name", "method", "choices", "seed", "command", "steps", "seconds", "warmup_seconds", "skipped", "resumed"),
     *("undetermined", "without_errors"),
@@ -61,10 +60,7 @@ def write_record(folder: Path, result: Result, status: str, error: str = "") -> 
 
 
 def write_result(folder: Path, result: Result, status: str) -> None:
-    """Write the history, the arrays and, last, run.json, each atomically. They are on disk when this returns.
-
-    Raises `InputError` if the folder is not writable, or the reader would reject the files.
-    """
+    """Write history, arrays and, last, run.json, each atomically and on disk. Raises `InputError` if that or reading it would fail."""
     check_writable(folder, result, status)
     try:
         files.make_folder(folder)

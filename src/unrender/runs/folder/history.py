@@ -28,8 +28,7 @@ LARGEST = 1 << 30
 THINNED_FROM = 1 << 26
 """Size in bytes from which a run's earlier steps are thinned."""
 _CHUNK = 1 << 20
-_REFINEMENTS = frozenset({"resolution", "faces"})
-"""Fields of the records that are never removed."""
+_REFINEMENTS = frozenset({"resolution", "faces"})  # fields of the records that are never removed
 
 
 # ---------------------------------------------------------------------- records
@@ -74,10 +73,7 @@ class HistoryFile:
         """Size of the file in bytes."""
 
     def rewrite(self, records: Iterable[Mapping[str, Any]], name_too: bool = True) -> None:
-        """Replace the contents by these records, and append after them; see `files.write`.
-
-        Raises `OSError` or `InputError`; the file is then unchanged.
-        """
+        """Replace the contents by these records, and append after them; see `files.write`. If it raises, the file is unchanged."""
         text = lines(records)
         files.write(self.path, text, name_too=name_too)
         opened = os.open(self.path, os.O_WRONLY | os.O_CLOEXEC)
@@ -173,7 +169,6 @@ class History:
     Attributes:
         seconds, samples: totals since the start, ascending.
         loss, gradient_noise: NaN if the record has no number.
-        parameter_error: {key: its error history}.
     """
 
     seconds: np.ndarray
@@ -203,10 +198,7 @@ class HistoryReader:
         self._reset()
 
     def read(self, to_the_end: bool = True) -> History:
-        """Return the current contents of the file, `to_the_end` with a last line that a running process may still be writing.
-
-        Raises `InputError`: the file is missing or too large, or a line is malformed; the message names file and line.
-        """
+        """Return the current contents, `to_the_end` with an unfinished last line. Raises `InputError` that names file and line."""
         with bounded_files.open_regular(self.path, self.folder) as file:
             status = os.fstat(file.fileno())
             if (status.st_dev, status.st_ino) != self._file or status.st_size < self._offset:

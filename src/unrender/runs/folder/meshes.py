@@ -66,10 +66,7 @@ def meshes_in(
     initial: Mapping[str, np.ndarray],
     path: Path,
 ) -> dict[str, RunMesh]:
-    """Return {key: mesh} from the contents of meshes.npz.
-
-    Raises `InputError` that names `path` for arrays that do not fit the parameters.
-    """
+    """Return {key: mesh} from the contents of meshes.npz. Raises `InputError` that names `path` if arrays do not fit the parameters."""
     meshes = {}
     for key, values in parameters.items():
         faces = arrays.get(f"{key}/{_FACES}")

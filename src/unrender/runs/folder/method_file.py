@@ -25,7 +25,6 @@ class Method(BaseModel):
 
     Attributes:
         name: name of the method; "" for none.
-        steps, seconds: the budget.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
         estimator, optimizer, other_starts, settings: See `Plan.table`.
     """

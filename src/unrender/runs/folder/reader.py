@@ -21,8 +21,7 @@ from unrender.runs.folder.meshes import RunMesh, meshes_in
 from unrender.runs.folder.schema import RunRecord
 from unrender.scene.surfaces import Surface, surface_error
 
-_MOST_LISTED = 1000
-"""Maximum number of entries of a folder that are searched for a hint."""
+_MOST_LISTED = 1000  # maximum number of entries of a folder that are searched for a hint
 
 
 @dataclass(frozen=True)
@@ -74,19 +73,14 @@ class RunFolder:
         return (*self.truth, *(key for key in self.error_before if key not in self.truth))
 
     def measure(self, key: str) -> ErrorMeasure:
-        """Return the error measure of a parameter."""
         return self.record.problem.measure(key)
 
     def shape(self, key: str) -> tuple[int, ...]:
-        """Return the shape of a parameter in the run."""
         return self.shapes.get(key, self.parameters[key].shape)
 
 
 def read(directory: str | Path) -> RunFolder:
-    """Read and check a run folder.
-
-    Raises `InputError` if it is missing, or one of its files or fields is missing, malformed, or outside of the folder.
-    """
+    """Read a run folder. Raises `InputError` if it, or a file or field of it, is missing, malformed, or outside of the folder."""
     path = Path(directory)
     record = read_run_record(path)
     history = HistoryReader(path / schema.HISTORY, path).read()

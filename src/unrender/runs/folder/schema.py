@@ -103,7 +103,6 @@ class ProblemRecord(BaseModel):
     measures: dict[StrictStr, Any] = {}
 
     def measure(self, key: str) -> ErrorMeasure:
-        """Return the error measure of a parameter."""
         return parameter_errors.from_record(self.measures.get(key))
 
     @property
@@ -117,16 +116,11 @@ class RunRecord(BaseModel):
 
     Attributes:
         status: activity of the run, or how it ended.
-        name: name of the problem.
-        method, settings: method and its options.
         choices, adapted: see `Result`.
         seed: seed of all random numbers.
         command: the command line; "" for a run of the library.
-        versions, hardware, variant: software and hardware.
         stopped: see `Result.stopped`; "" while it runs.
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
-        problem: description of the problem.
-        resumed: steps at which it was resumed.
         image_errors, undetermined, without_errors, phases: see `Result`.
         standard_error: standard errors of each number, {key: one value per element}, None for infinite; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
@@ -216,12 +210,9 @@ class Manifest(BaseModel):
     """manifest.json of a checkpoint.
 
     Attributes:
-        format: version of the format.
         step: number of completed steps.
-        seed: seed of the run.
         size, sha256: those of state.safetensors.
         versions: versions of the software on which the numbers depend.
-        problem: fingerprint of the problem.
         state: structure of the tensors, see `state.py`.
     """
 
@@ -260,10 +251,7 @@ def validate(model: type[Model], content: Any, where: str) -> Model:
 
 
 def encode(model: type[BaseModel], content: Any, where: str) -> bytes:
-    """Return the bytes of a JSON file that the reader accepts as the model.
-
-    Raises `InputError` if the reader would reject them; one line that begins with `where` and names the field.
-    """
+    """Return the bytes of a JSON file. Raises `InputError`, a line with `where` and the field, if the reader would reject them."""
     try:
         data = encode_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", where)
     except (TypeError, ValueError, RecursionError) as error:

@@ -55,7 +55,6 @@ def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
     components, and those in `patterns`. The name of a module in a file never imports it.
 
     Args:
-        packed: result of `pack`.
         patterns: states of the same components, if their classes are not registered.
 
     Raises:

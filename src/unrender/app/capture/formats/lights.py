@@ -20,8 +20,7 @@ from unrender.io import bounded_files, confinement
 
 FILE = "lights.txt"
 _LARGEST = 1 << 20
-_FEWEST = 4
-"""Minimum number of lights: three unknowns per pixel, and one equation to verify them."""
+_FEWEST = 4  # minimum number of lights: three unknowns per pixel, and one equation to verify them
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,7 @@ class HeadNode:
 
 _SLICE = 0.25
 """Longest wait of one call in seconds, and thereby longest delay of an exception that a handler of signals raises."""
-_ENDS = 10.0
-"""Seconds that a call may take to end after such an exception."""
+_ENDS = 10.0  # seconds that a call may take to end after such an exception
 
 
 class Waiter:
@@ -306,10 +305,8 @@ def _own_signals() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-_EVERY = 0.01
-"""Seconds between restorations of a signal's action."""
-_LARGEST_ACTION = 1024
-"""Bytes, more than `struct sigaction` has on any system."""
+_EVERY = 0.01  # seconds between restorations of a signal's action
+_LARGEST_ACTION = 1024  # bytes, more than `struct sigaction` has on any system
 
 
 @contextlib.contextmanager

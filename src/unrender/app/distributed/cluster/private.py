@@ -22,8 +22,7 @@ from unrender.core.text import one_line, reason_of
 _PREFIX, _LOCK = "unrender-ray-", "lock"
 _LONGEST = 107 - len("/unrender-ray-12345678/r/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store")
 """Maximum length of the folder that contains the cluster's, since a socket's path is limited to 107 bytes."""
-_YOUNG = 60.0
-"""Seconds until a folder without a lock counts as abandoned."""
+_YOUNG = 60.0  # seconds until a folder without a lock counts as abandoned
 _WATCHER = """
 import os, shutil, sys, time
 os.read(0, 1)

@@ -13,8 +13,7 @@ from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line
 
 _ATTEMPTS = 3
-_GRACE_SECONDS = 4.0
-"""Time for tasks to save their state after an interrupt, in seconds."""
+_GRACE_SECONDS = 4.0  # time for tasks to save their state after an interrupt, in seconds
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ def prepare_worker(name: str, threads: int) -> str:
 
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?):([0-9]{1,5})\Z")
 _MOST = 100_000
-_WORKER_BYTES = 512 << 20
-"""Memory of a worker with its libraries and a small problem."""
+_WORKER_BYTES = 512 << 20  # memory of a worker with its libraries and a small problem
 
 
 @dataclass(frozen=True)

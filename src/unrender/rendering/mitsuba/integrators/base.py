@@ -54,15 +54,12 @@ class StatePointers:
         return [pointer, remap(self._tables[kind], pointer)] if self.pair else [pointer]
 
     def bsdfs(self, bsdf: mi.BSDFPtr) -> list[mi.BSDFPtr]:
-        """Return the BSDF of each state."""
         return self._of("bsdf", bsdf)
 
     def emitters(self, emitter: mi.EmitterPtr) -> list[mi.EmitterPtr]:
-        """Return the emitter of each state."""
         return self._of("emitter", emitter)
 
     def media(self, medium: mi.MediumPtr) -> list[mi.MediumPtr]:
-        """Return the medium of each state."""
         return self._of("medium", medium)
 
     def interactions(self, si: mi.SurfaceInteraction3f) -> list[mi.SurfaceInteraction3f]:
@@ -75,10 +72,7 @@ class StatePointers:
 
 
 def pointer_table(current: Any, previous: Any) -> mi.UInt32:
-    """Return the table from the registry ids of one load's pointers to those of another load.
-
-    Raises `InputError` if the two loads differ in their number.
-    """
+    """Return the table from registry ids of one load's pointers to another's. Raises `InputError` if their numbers differ."""
     source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
     target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]
     if source.shape != target.shape:
@@ -225,7 +219,6 @@ class ScatteringVertex:
     """The last vertex where a path scattered, for the MIS weight of an emitter that its next segment hits. It is state of Dr.Jit loops.
 
     Attributes:
-        interaction: position of the vertex.
         pdf: solid angle density of the outgoing direction.
         delta: whether emitter sampling cannot sample that direction: perfectly specular lobes, and the camera.
     """

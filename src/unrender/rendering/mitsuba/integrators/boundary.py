@@ -45,8 +45,7 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import (
     lane_sampler,
 )
 
-_NEAR = 1e-3
-"""Relative margin at the end of a shadow ray within which occluders are ignored."""
+_NEAR = 1e-3  # relative margin at the end of a shadow ray within which occluders are ignored
 _OWN = 0.05
 """Relative distance from an edge of an emitter within which a point on the same emitter counts as the edge's face."""
 _EMITTER_POINTS, _PAIRS = 256, 1 << 20

@@ -12,8 +12,7 @@ from unrender.rendering.mitsuba.edges import EdgePoints
 from unrender.rendering.mitsuba.integrators.emitters import has_sun, inside_sun
 from unrender.rendering.mitsuba.samplers import RepeatingSampler
 
-_AREA, _POINT, _DISTANT = 0, 1, 2
-"""Kinds of emitters: area, point, and distant."""
+_AREA, _POINT, _DISTANT = 0, 1, 2  # kinds of emitters: area, point, and distant
 
 
 class WeightedChoice:

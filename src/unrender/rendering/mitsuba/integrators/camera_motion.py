@@ -29,8 +29,7 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import WeightedCho
 from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, MirroredView, glossy_radiance, is_glossy
 from unrender.rendering.mitsuba.pixel_filter import FilterSlopes, PixelFilters, is_box
 
-_ARCS = 16
-"""Number of pieces of a curve, which are sampled by their lengths in the image."""
+_ARCS = 16  # number of pieces of a curve, which are sampled by their lengths in the image
 _SPHERE, _CIRCLE, _TOP, _LEFT, _RIGHT = range(5)
 """Kinds of curves in local coordinates: silhouette of a unit sphere, unit circles at z = 0 and z = 1, and the two silhouette lines of the
 cylinder between them."""

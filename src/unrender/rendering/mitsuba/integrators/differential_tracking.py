@@ -25,12 +25,9 @@ class Reservoir:
     """A point of a path, sampled from all points where in-scattering may begin. It is state of Dr.Jit loops, hence mutable.
 
     Attributes:
-        ray: ray that the point lies on.
         t: distance along the ray.
-        medium: medium at the point.
         depth: depth of the path before the point.
         β: throughput of each state to the point, times its MIS weight, over σ̄.
-        weight: weight of the point.
         total: total weight of all points offered.
     """
 

@@ -85,8 +85,7 @@ def _ids(scene: mi.Scene) -> np.ndarray:
     return ids.numpy().astype(np.int64)
 
 
-_LARGEST = 1e18
-"""Maximum solid angle density. Twice its square is a finite single-precision number."""
+_LARGEST = 1e18  # Maximum solid angle density. Twice its square is a finite single-precision number.
 
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
@@ -130,7 +129,6 @@ _SUNS = {"SunskyEmitter", "TimedSunskyEmitter"}
 
 
 def has_sun(emitters: Iterable[mi.Emitter]) -> bool:
-    """Return whether one of the emitters has a sun."""
     return any(class_name(emitter) in _SUNS for emitter in emitters)
 
 

@@ -12,12 +12,9 @@ import numpy as np
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 
-_NEAR = 1e-3
-"""Relative margin at the end of a shadow ray within which occluders are ignored."""
-_BOUNCES = 2
-"""Maximum number of reflections by flat mirrors."""
-_PLANES = 12
-"""Maximum number of mirror planes with virtual edges."""
+_NEAR = 1e-3  # relative margin at the end of a shadow ray within which occluders are ignored
+_BOUNCES = 2  # maximum number of reflections by flat mirrors
+_PLANES = 12  # maximum number of mirror planes with virtual edges
 
 
 class FlatMirrors:
@@ -77,7 +74,6 @@ class MirroredView:
         ray: last segment.
         distance: length of all segments.
         depth: number of segments before the last.
-        β: throughput.
         linear: `mi.Matrix3f`, from directions of the virtual image to those of the world.
     """
 

@@ -21,11 +21,8 @@ import numpy as np
 
 from unrender.rendering.mitsuba import emissive
 
-_CELLS = 16
-"""Maximum number of cells along an axis."""
-
-_LEAST = 2
-"""Minimum number of voxels of a cell along an axis."""
+_CELLS = 16  # maximum number of cells along an axis
+_LEAST = 2  # minimum number of voxels of a cell along an axis
 
 _FINE = 16
 """Minimum number of voxels along the longest axis for a supergrid: the smallest measured size. Times on two CPU cores, relative to one
@@ -36,8 +33,7 @@ _MARGIN = 1.25
 """Factor from a cell's maximum extinction to its majorant, clamped to the grid's maximum. A tight majorant makes ratio-tracked
 transmittance noisy and decorrelates the states of a pair at null collisions."""
 
-_ROUNDING = 0.25
-"""Tolerance of a grid's position in voxels. Cells cover half a voxel more than interpolation reads."""
+_ROUNDING = 0.25  # Tolerance of a grid's position in voxels. Cells cover half a voxel more than interpolation reads.
 
 
 class MajorantSupergrids:
@@ -192,7 +188,6 @@ def to_local(volume: Any, to_world: np.ndarray) -> np.ndarray | None:
     map.
 
     Args:
-        volume: loaded volume.
         to_world: (4, 4), map from [0, 1]³ to the world according to its description.
     """
     box = volume.bbox()

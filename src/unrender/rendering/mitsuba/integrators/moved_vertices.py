@@ -23,17 +23,10 @@ from unrender.rendering.mitsuba.integrators.base import (
 )
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 
-_NUMBERS = 6
-"""Numbers per ellipsoid."""
-
-_THINNEST = 1e-2
-"""Minimum half axis, relative to the longest half axis of the bounding box."""
-
-_PADDING = 1e-4
-"""Padding relative to the largest coordinate, larger than rounding errors of rays and bounds."""
-
-_MARGIN = 1.01
-"""Factor of the half axes, for the same reason."""
+_NUMBERS = 6  # numbers per ellipsoid
+_THINNEST = 1e-2  # minimum half axis, relative to the longest half axis of the bounding box
+_PADDING = 1e-4  # padding relative to the largest coordinate, larger than rounding errors of rays and bounds
+_MARGIN = 1.01  # factor of the half axes, for the same reason
 
 
 def bounding_ellipsoids(meshes: Sequence[Sequence[Any]]) -> Float:
@@ -94,7 +87,6 @@ class PairState:
 
     Attributes:
         depth: number of segments traced.
-        current, previous: see `PathState`.
         same: lanes whose vertices are the same point of a static shape, or where neither path hit anything.
     """
 

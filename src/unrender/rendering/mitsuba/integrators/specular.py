@@ -11,8 +11,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.base import Bool, Float, PathContext, Spectrum, registry_id
 
-_SAME_DENSITY = 1e-3
-"""Relative difference up to which two densities of one direction are the same, for rounding."""
+_SAME_DENSITY = 1e-3  # relative difference up to which two densities of one direction are the same, for rounding
 DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
 """Entries of `tables["delta"]`, by registry id of BSDFs: dependence of perfectly specular lobes on the BSDF's parameters. None; only by
 their value (conductor, dielectric, plastic); by the opacity of a mask."""

@@ -47,7 +47,6 @@ class MediumSegment:
     Args:
         tables: majorants of `ScenePair.majorants()`; media without a supergrid there have their own majorant.
         media: `mi.MediumPtr` of each state.
-        ray: ray through the medium.
         near, far: results of `clip_segment`.
         active: lanes inside the medium.
         by_extinction: whether the MIS weights of the in-scattering derivative use σₜ instead of σₛ. This is cheaper if σₛ is expensive

@@ -96,10 +96,8 @@ def _read(values: Any, row: mi.UInt32) -> Any:
     return dr.gather(type(values), values, row)
 
 
-_DEEPEST = 16
-"""Maximum path length of cached paths in segments, since kernels have a stage for each."""
-_MOST_BYTES = 1 << 26
-"""Maximum memory of one rendering's paths in bytes. Larger renderings trace their adjoints."""
+_DEEPEST = 16  # maximum path length of cached paths in segments, since kernels have a stage for each
+_MOST_BYTES = 1 << 26  # Maximum memory of one rendering's paths in bytes. Larger renderings trace their adjoints.
 _MOST_ALIVE = 1 << 29
 """Maximum memory of all paths of a session that are in use, such as when a loop renders all views before their adjoints."""
 

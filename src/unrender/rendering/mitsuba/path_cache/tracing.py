@@ -44,8 +44,7 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 _TEXTURES = ("BitmapTextureImpl", "UniformSpectrum", "SRGBReflectanceSpectrum", "Checkerboard")
 """Prefixes of the class names of textures that only read texture coordinates."""
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
-_TRAVERSED = ("mitsuba", "unrender")
-"""Packages whose plugins declare all their objects to `mitsuba.traverse`."""
+_TRAVERSED = ("mitsuba", "unrender")  # packages whose plugins declare all their objects to `mitsuba.traverse`
 _FIXED = ("sampling_weight", "to_world", "to_uv")
 
 
@@ -93,10 +92,7 @@ class Lookups:
 
 
 def _slots(graph: ObjectGraph, node: Any, leaf: str) -> Iterator[tuple[Any, Any]]:
-    """Yield the lookup of a parameter's object for each chain of its owners: (texture, outermost BSDF) or (emitter, None).
-
-    Raises `ValueError` with the reason if one of them is not supported.
-    """
+    """Yield each lookup of a parameter: (texture, outermost BSDF) or (emitter, None). Raises `ValueError` with the reason for others."""
     if leaf in _FIXED:
         raise ValueError("the directions of paths depend on it")
     chains, checked = list(graph.chains(node)), set()
