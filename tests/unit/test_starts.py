@@ -266,6 +266,8 @@ def test_places_of_a_shape_share_launches(shape: tuple[int, int], views: int, mo
         ("fill.rotation.y", 1.0, False),
         ("lamp.rotation.y", 1.0, False),
         ("box.rotation.x", 1.0, False),
+        ("fill.position", 1.0, True),
+        ("fill.position", 2.0, False),
     ],
 )
 def test_lights_that_may_be_exchanged_have_a_line(
@@ -274,14 +276,15 @@ def test_lights_that_may_be_exchanged_have_a_line(
     """Lights of other colours, other unknown coordinates, or a single one, are not exchanged."""
     values = {"lamp.intensity": np.ones(1), "fill.intensity": np.full(1, light)}
     poses = {f"{name}.rotation.{axis}": np.zeros(1) for name in ("lamp", "fill", "box") for axis in "xy"}
-    renderer = AnalyticRenderer({**values, **poses}, np.zeros((48, 8)))
+    poses |= {f"{name}.position": np.zeros(1) for name in ("lamp", "fill")}
+    renderer = AnalyticRenderer({**values, **poses}, np.zeros((48, 10)))
     known = {
         key: dataclasses.replace(
-            info, rigid=key in poses, light="box" not in key, brightness="light" if key in values else ""
+            info, rigid="rotation" in key, light="box" not in key, brightness="light" if key in values else ""
         )
         for key, info in renderer.parameters().items()
     }
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
-    unknown = [Parameter("lamp.rotation.x"), Parameter(other)]
+    unknown = [Parameter(other.replace("fill", "lamp") if "position" in other else "lamp.rotation.x"), Parameter(other)]
     scene = Problem(renderer, unknown, [View(np.zeros((4, 4, 3)))])
     assert starts.exchangeable_lights(scene) == (["lamp", "fill"] if told else [])

@@ -138,3 +138,31 @@ def test_a_run_of_few_steps_with_a_better_picture_is_unfinished(steps: int, told
     result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.03), steps=steps)
     assert result.status == "finished"
     assert [line.split()[0] for line in result.warnings if "further" in line] == (["y"] if told else [])
+
+
+class OfLights(AnalyticRenderer):
+    """Two lights with a position and an intensity each."""
+
+    def parameters(self) -> dict[str, ParameterInfo]:
+        infos = super().parameters()
+        return {key: replace(info, brightness="light" if "intensity" in key else "") for key, info in infos.items()}
+
+
+@pytest.mark.parametrize("light", [1.0, 2.0])
+def test_equal_lights_in_each_others_place_have_the_errors_of_the_nearer_places(light: float) -> None:
+    """They "end further from the truth than they began", though the picture is the same."""
+    values = {f"{name}.position": np.full(3, at) for name, at in (("lamp", 1.0), ("fill", -1.0))}
+    lights = {"lamp.intensity": np.ones(1), "fill.intensity": np.full(1, light)}
+    renderer = OfLights({**values, **lights}, np.ones((SIDE * SIDE * 3, 8)), noise=0.02, shape=(SIDE, SIDE))
+    view = ur.View(renderer.exact({**values, **lights}))
+    problem = ur.Problem(renderer, [ur.Parameter(key) for key in values], [view], truth=values)
+    last = {"lamp.position": np.full(3, -0.99, np.float32), "fill.position": np.full(3, 0.99, np.float32)}
+    first = {key: (0.5 * x).astype(np.float32) for key, x in values.items()}
+    found = further_from_truth(problem, FreshPictures(problem, 0, 0), first, last, False, 1.0)
+    if light == 1.0:
+        (line,) = found
+        assert line.startswith(
+            "lamp, fill ended in each other's place, where the pictures are the same: exchanged, the errors are "
+        )
+    else:
+        assert not any("place" in line for line in found)

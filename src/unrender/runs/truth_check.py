@@ -8,7 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.methods.rules.starts import exchangeable_pairs
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, root_of_covariance, seen_cells
@@ -23,6 +25,8 @@ _FURTHER, _FURTHER_EARLY = 1.1, 1.5
 """Ratio of a parameter's last error to its first from which a warning is given; the second one for runs of few steps."""
 _ERRORS = 2.0
 """Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
+_EXCHANGED = 0.5
+"""Largest geometric mean of the ratios of two lights' errors after and before an exchange that is told."""
 _PROBES, _SECONDS_SHARE = 8, 0.02
 """Probes of the sensitivity; fraction of the run's time after which no further one is started."""
 _SIGNS_SEED, _DRAWS = 5, 8
@@ -56,12 +60,13 @@ def further_from_truth(
         errors: {key: array}, standard errors of the run, for parameters without a sensitivity, such as poses.
     """
     ratio = _FURTHER_EARLY if few else _FURTHER
+    last, places = exchanged(problem, last)
     before, after = problem.parameter_error(first), problem.parameter_error(last)
     # The error over all cells grows less than that of the seen ones if the others do not change.
     least = {key: 1.0 if last[key].ndim >= MAP_AXES else _FURTHER for key in after}
     suspects = [key for key, error in after.items() if 0.0 < least[key] * before[key] < error]
     if not suspects:
-        return []
+        return places
     truth = {**last, **{key: value for key, value in problem.truth.items() if key in last}}
     of = _curvature(problem, pictures, truth, seconds)
     sensitivities = of.sensitivity()
@@ -84,7 +89,30 @@ def further_from_truth(
                 f"{key} ends further from the truth than it began{words}: error {measure.text(end)}, {measure.text(start)} at the "
                 "start; the images may allow several solutions: try another start, bounds, or more views"
             )
-    return lines
+    return [*places, *lines]
+
+
+def exchanged(problem: Problem, values: Mapping[str, np.ndarray]) -> tuple[Mapping[str, np.ndarray], list[str]]:
+    """Return values with equal lights exchanged where that is nearer to the truth, and a line about each such pair.
+
+    All values of such a light are unknown or equal to those of the other, so the pictures stay the same. Poses are relative to a light's
+    own place, so lights with these are left as they are.
+    """
+    infos, lines = problem.renderer.parameters(), []
+    for pair in exchangeable_pairs(problem):
+        one, other = ([key for key in values if key.startswith(f"{name}.")] for name in pair)
+        partners = dict(zip([*one, *other], [*other, *one], strict=True)) if len(one) == len(other) else {}
+        equal = all(key.removeprefix(pair[0]) == partners[key].removeprefix(pair[1]) for key in one if partners)
+        if not partners or not equal or any(infos[key].rigid or key not in problem.truth for key in partners):
+            continue
+        swapped = {**values, **{key: values[partner] for key, partner in partners.items()}}
+        now, then = (problem.parameter_error(x) for x in (values, swapped))
+        if math.prod(then[key] / now[key] for key in partners if now[key] > 0.0) < _EXCHANGED ** len(partners):
+            values, errors = swapped, [f"{key} {problem.unknowns[key].measure.text(then[key])}" for key in partners]
+            lines.append(
+                f"{listed(pair)} ended in each other's place, where the pictures are the same: exchanged, the errors are {listed(errors)}"
+            )
+    return values, lines
 
 
 def _curvature(problem: Problem, pictures: FreshPictures, truth: Mapping[str, np.ndarray], seconds: float) -> Curvature:
