@@ -28,7 +28,7 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.runs.run import Run
-from unrender.runs.verification import PRIOR, STEPS, STEPS_OF_FEW, Misfit, fit_status
+from unrender.runs.verification import NOISE, PRIOR, STEPS, STEPS_OF_FEW, Misfit, fit_status
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
@@ -367,7 +367,10 @@ def test_a_loss_that_falls_or_has_an_uncertain_change_is_judged_by_large_differe
     values = {"map": np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)}  # type: ignore
     result = Result(values, values, [{}] * 150, 1.0, 0.0, "steps")
     result = replace(result, verification={"best": "end", "change": {"step": step, "loss": [change, error]}})
-    differs = final_images.render_final_images(made, result, 16, tested=False).misfit
+    result = replace(result, standard_error={"map": np.full(32, 0.1)})
+    found = final_images.render_final_images(made, result, 16, tested=False)
+    differs = found.misfit
+    assert bool(found.standard_error) is (differs is None or NOISE in differs.causes)
     assert (differs is not None) is (stays or shift == 0.25 or change >= 0.0)
     known = not (stays or shift == 0.25) and differs is not None
     assert (differs is not None and "as the noise of references with" in differs.line) is known

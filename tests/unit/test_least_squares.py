@@ -214,6 +214,23 @@ def test_a_run_that_ended_early_is_told_its_step():
     assert not found.undetermined
 
 
+@pytest.mark.parametrize("bound", [0.4, 0.6])
+def test_a_solution_beyond_a_bound_is_told(bound: float):
+    """The other numbers make up for a bound that excludes the true value."""
+    made = problem(MATRIX)
+    parameters = [u.parameter for u in made.unknowns.values()]
+    parameters[1] = ur.Parameter("b", 0.25, bounds=(0.0, bound))
+    made = ur.Problem(made.renderer, parameters, made.views)
+    end = best(made, MATRIX)
+    end[3] = min(end[3], bound)
+    target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0 - end[3] * MATRIX[:, 3]
+    end[:3] = np.linalg.lstsq(MATRIX[:, :3], target, rcond=None)[0]
+    found = check_numbers(made, at(end), made.initial_values(), FAR)
+    told = ["b: the least-squares solution is beyond its bound by 0."] if bound < 0.5 else []
+    assert [line[: len(told[0])] for line in found.unfinished.values()] == told
+    assert np.isinf(found.errors["b"]) == (bound < 0.5)
+
+
 def test_steps_are_not_told_of_losses_with_another_minimum():
     made = problem(MATRIX)
     made = ur.Problem(made.renderer, [u.parameter for u in made.unknowns.values()], made.views, loss=ur.losses.L1())
@@ -355,6 +372,50 @@ def test_a_rare_bright_sample_that_hides_a_slope_leaves_its_number_without_a_sta
         assert np.isfinite(errors["a"]).all()
         assert bool(found.noisy(())) is bool(expected)
         assert not found.noisy(("b",))
+
+
+SIDE = 24
+
+
+def _scenery(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) of a smooth background, in pixels from its centre."""
+    return np.stack([1.0 + 0.2 * np.sin(0.5 * x + k) * np.cos(0.4 * y) for k in range(3)], axis=-1)
+
+
+def _seen(moved: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The picture with a spot that has moved by a number of pixels along x."""
+    return _scenery(x, y) + np.exp(-0.1 * ((x - 5.0 - moved) ** 2 + (y - 3.0) ** 2))[..., None]
+
+
+@pytest.mark.parametrize(
+    ("distort", "words"),
+    [
+        (lambda x, y: (x, y), ""),
+        (lambda x, y: (x - 1.0, y), "as if the reference of view 0 were shifted by 0.9"),
+        (
+            lambda x, y: (0.95 * x, 0.95 * y),
+            "as if the reference of view 0 had another field of view, which would move a by",
+        ),
+        (lambda x, y: (x + 0.05 * y, y - 0.05 * x), "were turned by 2.8° clockwise"),
+    ],
+)
+def test_numbers_have_no_standard_errors_where_a_distortion_of_the_reference_would_move_them(distort: Any, words: str):
+    """A pose beside a reference that was shifted by a pixel ended 110 of its standard errors away in silence."""
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    matrix = (_seen(0.1, x, y) - _seen(-0.1, x, y)).reshape(-1, 1) / 0.2
+    renderer = AnalyticRenderer(
+        {"a": np.zeros(1)}, matrix, offset=_seen(0.0, x, y), noise=0.0, grain=0.2, shape=(SIDE, SIDE)
+    )
+    noise = np.random.default_rng(2).normal(0.0, 0.02, (SIDE, SIDE, 3))
+    view = ur.View((_seen(0.0, *distort(x, y)) + noise).astype(np.float32))
+    made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [view])
+    solution = np.linalg.lstsq(matrix, (np.asarray(view.reference, np.float64) - _seen(0.0, x, y)).ravel(), rcond=None)[
+        0
+    ]
+    found = check_numbers(made, {"a": solution.astype(np.float32)}, made.initial_values(), FAR)
+    assert words in found.distorted
+    assert bool(found.distorted) == bool(words)
+    assert bool(found.errors) == (not words)
 
 
 def test_no_time_no_check():

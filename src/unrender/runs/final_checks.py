@@ -14,6 +14,7 @@ from unrender.estimators.penalties import penalty
 from unrender.runs.determination import changed
 from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
 from unrender.runs.folder.schema import MISFIT
+from unrender.runs.reference_distortions import distortions
 from unrender.runs.result import Result
 from unrender.runs.verification import (
     PRIOR,
@@ -43,8 +44,6 @@ _AROUND, _OF_AROUND = 5, 0.8
 elements in a pixel may cancel."""
 _FEWEST, _MOST_KEYS = 64, 12
 """Fewest pixels that are judged, and most unknowns that change as a whole."""
-_EQUAL, _PLATEAU = 1e-3, 16
-"""Relative difference of values that count as equal, and fewest values equal to the largest of a reference that is saturated."""
 _BLOCK, _ELSEWHERE = 8, 0.25
 """Side of the blocks of pixels, and share of them that does not count beside unknown poses: the object may belong there."""
 _OF_POSE = "the pose needs more steps or another start, or "
@@ -324,7 +323,7 @@ def _as_if(
         wanted, again = (np.ravel(half[part] * root) for half in (one, other))
         noise, best, explained = np.square(wanted - again) / 2.0, "", {}
         image, reference = (x.reshape(*sizes[view], 3) for x in (images[1::2, part].mean(axis=0), references[part]))
-        for index, (words, changes) in enumerate(_distortions(image, reference).items()):
+        for index, (words, changes) in enumerate(distortions(image, reference).items()):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
             amounts = inverse @ (columns.T @ wanted)
@@ -341,28 +340,6 @@ def _as_if(
             alone = explained.pop(best) > _DISTINCT * max(explained.values())
             cause = f", as if the reference of view {view} {best}" if alone else ""
     return cause, shared, sure
-
-
-def _distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
-    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts; brightness first.
-
-    Its reference (H, W, 3) may be saturated only where many of its values equal the largest: noise exceeds a single brightest value.
-    """
-    from scipy.ndimage import gaussian_filter  # takes long to import
-
-    down, along = np.gradient(image, axis=(0, 1))
-    height, width = image.shape[:2]
-    y, x = np.mgrid[:height, :width] - np.array([height - 1, width - 1]).reshape(2, 1, 1) / 2
-    white = float(reference.max())
-    equal = reference >= (1.0 - _EQUAL) * white
-    saturated = (equal & (np.count_nonzero(equal) >= _PLATEAU)) * (np.minimum(image, white) - image)
-    return {
-        lambda by: f"were {1.0 - by[0]:.2g} times as bright": [image],
-        lambda by: f"were shifted by {-by[0]:.2g} pixels along x and {-by[1]:.2g} along y": [-along, -down],
-        lambda by: "were blurred" if by[0] < 0.0 else "were sharper": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
-        lambda by: f"were saturated at {white:.3g} (set the loss Censored)": [saturated],
-        lambda by: "had another field of view": [x[..., None] * along + y[..., None] * down],
-    }
 
 
 def _joined(pictures: Sequence[np.ndarray]) -> np.ndarray:

@@ -37,7 +37,7 @@ from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
-from unrender.runs.verification import Misfit, misfit_of_views
+from unrender.runs.verification import DIFFERS, NOISE, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -148,23 +148,23 @@ def render_final_images(
         lines, warnings, maps = [], (), _untested(problem, result, _NOT_TESTED)
         can_check = _cost_of_check(problem) * spent < _PICTURES_SHARE * left()
         differs = _differs(problem, result, chosen, halves_of, samples, can_check)
+        still = None if differs else differs_still(problem, result, chosen, ends, samples)
+        fits = not differs and (still is None or NOISE in still.causes)
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             deviations = _without(deviations, late.unchecked)
             lines = [*untested_factor(problem), *untested_changes(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
-                problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
+                problem, result, sensitivities, 0.25 * tests, weights, fits=fits, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
-    deviations = {} if differs else {**deviations, **maps.standard_error}
-    if differs:
-        maps = _untested(problem, result, "the final picture differs from the references by more than noise")
-    else:
-        differs = differs_still(problem, result, chosen, ends, samples)
+    fits, differs = fits and not differs, differs or still
+    maps = maps if fits else _untested(problem, result, f"{DIFFERS} by more than noise")
+    deviations = {**deviations, **maps.standard_error} if fits else {}
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
     texts, errors_of = (*lines, *maps.limited), (deviations, maps.data_share, maps.missing)
@@ -260,6 +260,8 @@ def _undetermined(
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])
         lines += numbers.noisy(result.standard_error)
+    elif numbers.distorted:
+        lines.append(numbers.distorted)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in told)
     return lines, unfinished, deviations, [*numbers.undetermined]

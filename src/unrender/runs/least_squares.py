@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -24,6 +24,7 @@ from unrender.estimators.hybrid import HybridGradient, HybridState
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
+from unrender.runs.reference_distortions import distortion_of_fit
 from unrender.runs.verification import compares
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -49,6 +50,8 @@ _OF_WIDTHS, _TOGETHER = 10.0, 0.9
 """Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
 """Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
+_DISTORTED = 2.0
+"""Standard errors by which a distortion of the references must move a number, if it is the reason for no standard errors."""
 _FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
 """Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
 the noisiest pixels that may hide it."""
@@ -161,7 +164,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
         directions, length = _directions(again, numbers.limits, change)
     check = _checked(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
-    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
+    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="") if fixed else check
 
 
 def _of_tested_views(check: NumbersCheck, numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> NumbersCheck:
@@ -226,7 +229,9 @@ class _Fit:
         unseen: largest changes of the numbers along each hidden direction that leaves them open, signed, (n, number of hidden directions).
         blind: largest changes of the numbers along the other hidden directions, whose slopes this check does not know, (n,).
         better: standard errors by which the picture is better than with the start's numbers.
-        beyond: whether the solution is beyond a bound of the number by more than noise, (n,).
+        beyond: distance of the solution beyond a bound of the number, (n,); 0 where noise may explain it.
+        distortion: what a reference looks like, see `distortion_of_fit`; "" for nothing.
+        moves: change of the numbers if it were so, (n,).
     """
 
     covariance: np.ndarray
@@ -236,7 +241,9 @@ class _Fit:
     unseen: np.ndarray
     blind: np.ndarray | float = 0.0
     better: float = math.inf
-    beyond: np.ndarray | bool = False
+    beyond: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    distortion: str = ""
+    moves: np.ndarray | float = 0.0
 
     @classmethod
     def of(
@@ -277,7 +284,8 @@ class _Fit:
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, noises))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         rounding = 1e-6 * np.abs(numbers.point[:n])
-        beyond = np.abs((changes @ along - step)[:n]) > _ERRORS * np.hypot(error, own) + rounding
+        beyond = (changes @ along - step)[:n]
+        beyond = np.where(np.abs(beyond) > _ERRORS * np.hypot(error, own) + rounding, beyond, 0.0)
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
@@ -286,7 +294,11 @@ class _Fit:
         unseen = changes[:n] * (hidden[None] & open_)
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
-        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better, beyond)
+        seen = np.where(hidden[:, None, None], 0.0, slopes)
+        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, np.where(hidden, 0.0, inverse))
+        return cls(
+            total, error, own, step[:n], unseen[:, hidden], blind, better, beyond, distortion, changes[:n] @ moves
+        )
 
 
 def _better(residuals: np.ndarray, before: np.ndarray) -> float:
@@ -317,7 +329,8 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     blind = fit.blind > np.maximum(error, fit.own)
     own = np.where(blind, np.inf, fit.own)
     of_step = np.maximum(error, own)  # references without noise leave the noise of this check
-    further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes)
+    outside = np.abs(fit.beyond) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
+    further = (np.abs(fit.step) > least) & ~outside.any()  # more steps lead no further than the bound
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
     moved = np.abs(numbers.tangents()[:n, :n] @ (numbers.point[:n] - numbers.start))
@@ -328,6 +341,11 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
             undetermined[key] = (
                 f"{key}: the pictures are no better than with its initial value, beyond noise, so it may be in a local minimum; give more "
                 "samples, bounds, or another start"
+            )
+        elif outside[of].any() and numbers.problem.loss.linear:
+            unfinished[key] = (
+                f"{key}: the least-squares solution is beyond its bound by {_numbers(fit.beyond[of])}, with the standard error "
+                f"{_numbers(of_step[of])}; widen its bounds, or something that is not among the unknowns is wrong"
             )
         elif open_[of].any():
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
@@ -345,10 +363,28 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"standard error {_numbers(of_step[of])}; give more steps or seconds, or resume the run"
             )
     # Beyond its own size an error is not linear, and at a bound it is not that of the solution.
-    known = np.where((error > sizes) | refuted | fit.beyond, np.inf, error)
+    known = np.where((error > sizes) | refuted | (fit.beyond != 0.0), np.inf, error)
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
+    if line := _distorted(numbers, fit, of_step):
+        return NumbersCheck({}, unfinished, {}, steps, noise, numbers.keys, distorted=line)
     return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
+
+
+def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray) -> str:
+    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,); "" for none."""
+    moves = np.broadcast_to(fit.moves, of_step.shape)
+    moved = [
+        f"{key} by {_numbers(moves[of])}"
+        for key, of in numbers.places().items()
+        if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
+    ]
+    if not moved:
+        return ""
+    return (
+        f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references as if {fit.distortion}, which would move "
+        f"{listed(moved)}; check the references and the camera"
+    )
 
 
 def _shared_with_fields(covariance: np.ndarray, n: int) -> np.ndarray:

@@ -269,13 +269,14 @@ class NumbersCheck:
 
     Attributes:
         undetermined: {key: line} of the numbers that the references leave open.
-        unfinished: {key: line} of those that a least-squares step would still move.
+        unfinished: {key: line} of those that a least-squares step would still move, or whose solution is beyond a bound.
         errors: {key: standard errors} of all numbers but the unchecked ones, the references' noise included.
         steps: {key: least-squares steps} of all numbers.
         noise: {key: standard errors of the steps by the noise of this check}.
         unchecked: keys of the numbers whose standard errors are unknown.
         blind: keys of the numbers whose influence on the pictures is hidden by the noise of this check.
         elsewhere: keys of the numbers that only other views show than the tested ones.
+        distorted: line about references that look distorted, so that the numbers have no standard errors; "" for none.
         fixed: {key: reason} of unknowns that trade off against the numbers in directions that the test leaves out; {} if there was no
             time for the test.
     """
@@ -289,6 +290,7 @@ class NumbersCheck:
     blind: tuple[str, ...] = ()
     elsewhere: tuple[str, ...] = ()
     fixed: Mapping[str, str] = field(default_factory=dict)
+    distorted: str = ""
 
     def missing(self, reported: Collection[str] = ()) -> list[str]:
         """Return lines: why the standard errors of the unchecked numbers, and of those of other views, are unknown.
@@ -296,6 +298,8 @@ class NumbersCheck:
         Args:
             reported: keys to leave out, since other lines are about them.
         """
+        if self.distorted:
+            return [self.distorted]
         keys = [key for key in self.unchecked if key not in reported]
         if not keys:
             return [f"{key}: no standard error: the views that are tested do not show it" for key in self.elsewhere]

@@ -146,7 +146,7 @@ def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]
     pairs = [(one + part, other + part) for part in counted if not part.endswith(_NORMALS)]
     fixed = [pair for pair in pairs if not any(key in problem.shapes() for key in pair)]
     values = problem.renderer.values([key for pair in fixed for key in pair])
-    return all(_equal(*(np.asarray(values[key]) for key in pair), infos[pair[0]].welded) for pair in fixed)
+    return all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed)
 
 
 def _equal(one: np.ndarray, other: np.ndarray, vertices: bool) -> bool:

@@ -1,0 +1,93 @@
+"""Distortions of references, such as shifts and turns, and those that the residual of a fit looks like."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unrender.statistics import scores
+from unrender.statistics.paired_losses import slices_of_images
+
+if TYPE_CHECKING:
+    from unrender.runs.numbers import Numbers
+
+_EQUAL, _PLATEAU = 1e-3, 16
+"""Relative difference of values that count as equal, and fewest values equal to the largest of a reference that is saturated."""
+_SURE, _OWN, _LEAST_SIDE = 6.0, 0.05, 8
+"""Standard errors of an amount from which a distortion is seen; share of its change of the picture that the unknowns must leave; fewest
+pixels of the shorter side of a picture."""
+
+
+def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
+    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts; brightness first.
+
+    Its reference (H, W, 3) may be saturated only where many of its values equal the largest: noise exceeds a single brightest value.
+    """
+    from scipy.ndimage import gaussian_filter  # takes long to import
+
+    down, along = np.gradient(image, axis=(0, 1))
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width] - np.array([height - 1, width - 1]).reshape(2, 1, 1) / 2
+    white = float(reference.max())
+    equal = reference >= (1.0 - _EQUAL) * white
+    saturated = (equal & (np.count_nonzero(equal) >= _PLATEAU)) * (np.minimum(image, white) - image)
+    return {
+        lambda by: f"were {1.0 - by[0]:.2g} times as bright": [image],
+        lambda by: f"were shifted by {-by[0]:.2g} pixels along x and {-by[1]:.2g} along y": [-along, -down],
+        lambda by: "were blurred" if by[0] < 0.0 else "were sharper": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
+        lambda by: f"were saturated at {white:.3g} (set the loss Censored)": [saturated],
+        lambda by: "had another field of view": [x[..., None] * along + y[..., None] * down],
+        lambda by: (
+            f"were turned by {abs(math.degrees(by[0])):.2g}° {'counterclockwise' if by[0] < 0.0 else 'clockwise'}"
+        ): [x[..., None] * down - y[..., None] * along],
+    }
+
+
+def distortion_of_fit(
+    numbers: Numbers, residuals: np.ndarray, after: np.ndarray, slopes: np.ndarray, inverse: np.ndarray
+) -> tuple[str, np.ndarray]:
+    """Return which reference looks distorted after a least-squares fit, and the change of the solution with it, (K,); "" and 0 for none.
+
+    Each distortion of a view is fitted together with the K directions of the fit. Brightness is left out, since rare bright samples
+    change it. The distorted pictures have other noise than the residuals to which they are fitted.
+
+    Args:
+        residuals, after: two independent residuals before and after the step of the fit, (2, P, 3), with the roots of the pixels' weights.
+        slopes: changes of the pictures along the directions, (K, P, 3); 0 where noise hides them.
+        inverse: (JᵀJ)⁻¹ of the directions, (K, K).
+    """
+    words, moves, most, mean = "", np.zeros(len(slopes)), 0.0, after.mean(axis=0)
+    sizes = [numbers.problem.sizes[view] for view in numbers.views]
+    for view, part, size in zip(numbers.views, slices_of_images(sizes), sizes, strict=True):
+        if min(size) < _LEAST_SIDE:
+            continue
+        reference, roots = np.asarray(numbers.problem.views[view].reference, np.float64), numbers.roots(view)
+        images = (residuals[:, part] / np.where(roots > 0.0, roots, math.inf)).reshape(2, *size, 3) + reference
+        halves = [list(distortions(image, reference).items()) for image in images]
+        for (describe, one), (_, other) in list(zip(*halves, strict=True))[1:]:
+            both = [np.reshape(change, (len(change), -1, 3)) * roots for change in (one, other)]
+            own = 0.5 * (both[0] + both[1])
+            shared = np.tensordot(slopes[:, part], own, axes=((1, 2), (1, 2)))
+            gains, squares = inverse @ shared, np.tensordot(*both, axes=((1, 2), (1, 2)))
+            matrix = 0.5 * (squares + squares.T) - shared.T @ gains
+            if not np.linalg.eigvalsh(matrix)[0] > _OWN * float(np.diag(squares).max()):
+                continue
+            # The part of the distortion that no direction explains, (k, P, 3), and its product with the residuals.
+            rest = np.tensordot(-gains.T, slopes, axes=1)
+            product = np.tensordot(rest, mean, axes=2)
+            product += 0.5 * sum(np.tensordot(both[half], after[1 - half, part], axes=2) for half in (0, 1))
+            rest[:, part] += own
+            amounts = np.linalg.solve(matrix, product)
+            left = mean - np.tensordot(amounts, rest, axes=1)
+            middle = np.zeros_like(matrix)
+            for change, residual in zip(numbers.by_view(rest), numbers.by_view(left[None]), strict=True):
+                score = (change * residual).sum(axis=3)
+                middle += scores.covariance(score, score)
+            errors = np.sqrt(np.maximum(np.diag(np.linalg.solve(matrix, np.linalg.solve(matrix, middle).T)), 0.0))
+            explained = float(amounts @ matrix @ amounts)
+            if explained > most and (np.abs(amounts) > _SURE * errors).any():
+                words, moves, most = f"the reference of view {view} {describe(amounts)}", gains @ amounts, explained
+    return words, moves
