@@ -77,6 +77,7 @@ MESHES = [
     "relief",
     "lenses",
 ]  # test_shapes.py, test_mesh_runs.py, test_relief.py, test_lenses.py
+WORLDS_AND_PRIORS = ["one-jar", "noisy-tiles"]  # see test_view_worlds.py, test_rendered_priors.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 
@@ -123,7 +124,7 @@ def limit(count: int, level: float = 1e-4) -> float:
 
 def test_the_first_problem_is_the_one_to_begin_with():
     assert NAMES[0] == "indirect-room"
-    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, *MESHES, "camera"} == set(NAMES)
+    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, *MESHES, *WORLDS_AND_PRIORS, "camera"} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)

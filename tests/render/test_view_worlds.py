@@ -198,6 +198,37 @@ def test_lamps_of_three_pictures_are_told_apart() -> None:
     assert result.status == "finished"
 
 
+def seen(made: ur.Problem, values: dict[str, np.ndarray], spp: int = 1024) -> list[np.ndarray]:
+    return [ur.render(made, values, view=view, spp=spp) for view in range(len(made.views))]
+
+
+@pytest.mark.slow
+def test_a_jar_in_four_worlds_is_recovered() -> None:
+    """Lamps off, the jar turned, and outdoors: pictures at the truth, the gradient by differences of pictures, and the descent."""
+    made = ur.gallery.problem("one-jar", resolution=24, texture_resolution=8)
+    references = [np.asarray(view.reference) for view in made.views]
+    true = seen(made, made.truth)
+    for n in range(4):  # own and other view's world, the planted fault
+        own, other = (np.abs(true[n] - references[m]).mean() / true[n].mean() for m in (n, n - 1))
+        assert own < 0.04
+        assert other > 0.1
+    start = made.initial_values()
+    estimator, point, found = ur.PathGradient(spp=64), made.initial(), []
+    for seed in range(8):
+        estimate = estimator.estimate(made, point, estimator.init(made, point), Key(seed))[0]
+        found.append([float(np.sum(x)) for x in as_numpy(estimate).gradient.values()])
+    for number, (key, step) in enumerate(zip(start, (0.02, 0.5), strict=True)):
+        ends = [seen(made, {**start, key: start[key] + sign * step}) for sign in (1, -1)]
+        losses = [sum(float(np.mean(np.square(a - b))) for a, b in zip(end, references, strict=True)) for end in ends]
+        slope, mean = (losses[0] - losses[1]) / (2 * step), np.mean(found, axis=0)[number]
+        error = 5 * np.std(found, axis=0, ddof=1)[number] / np.sqrt(len(found)) + 0.01 * abs(slope)
+        assert abs(mean - slope) < error
+        assert abs(0.75 * mean - slope) > error
+    result = ur.optimize(made, steps=80, progress=False)
+    for key, error in made.parameter_error(result.parameters).items():
+        assert error < 0.3 * made.parameter_error(start)[key]
+
+
 # ---------------------------------------------------------------------- files
 
 XML = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>

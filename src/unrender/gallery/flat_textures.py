@@ -1,4 +1,4 @@
-"""Problems `poster` and `caustic`: a flat texture in direct light, and the tiles of a floor in caustics.
+"""Problems `poster`, `noisy-tiles` and `caustic`: a flat texture in direct light, with a prior too, and the tiles of a floor in caustics.
 
 `poster`, TEXTURE of Wang et al., section 4, shows how derivatives from perturbed renders scale with the dimension, and why an n × n matrix
 must not be formed. Path gradients, whose cost does not depend on the number of texels, solve it easily.
@@ -9,7 +9,7 @@ hits a lamp rarely, and is bright when it does, so a few samples per pixel conta
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -17,13 +17,22 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts
+from unrender.gallery.specification import build_problem, views_of
 from unrender.preconditioners import LargeSteps
+from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
 
 _RADIUS, _HEIGHT = 0.34, 0.85  # radius of the balls of `caustic`, and height of their centres above the floor
 
 _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75, 0.9, 1.0))}
 """x and z of their centres, and tint."""
+
+_COLOURS = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
+_SHADES = (1.1, 0.75)
+"""Colours of the tiles, and factors of light and dark ones."""
+
+_PRIORS = ("total_variation", "palette", "none")
 
 
 @register(name="poster", position=20)
@@ -41,9 +50,8 @@ class Poster(fields.Rendered):
 
     def scene(self) -> dict[str, Any]:
         """Return the poster, x and y in [-1, 1] at z = 0, filling the image, with the lamp before it, above the field of view."""
-        picture = parts.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True)
         # Texels are squares. With interpolation, no image would distinguish the finest pattern from its mean grey.
-        texels = parts.bitmap(picture.astype(np.float32)) | {"filter_type": "nearest"}
+        texels = parts.bitmap(self.texture()) | {"filter_type": "nearest"}
         paint = {"type": "diffuse", "reflectance": texels}
         down = np.array([0.0, -0.6, -0.8])
         return {
@@ -59,8 +67,39 @@ class Poster(fields.Rendered):
             ),
         }
 
+    def texture(self) -> np.ndarray:
+        return parts.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True).astype(np.float32)
+
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter("poster.bsdf.reflectance.data", initial=0.5),)
+
+
+@register(name="noisy-tiles", position=37)
+@dataclass(frozen=True)
+class NoisyTiles(Poster):
+    """A mosaic of few colours from one noisy image, with a prior of its texture.
+
+    One view. One unknown, the reflectance (texture_resolution², 3), initially constant. The image has the noise of few photons, which
+    without a prior stays in the texture. The prior, in units of that noise, is a total variation, or a palette of the tiles' colours.
+    """
+
+    photons: int = fields.integer(200, "mean number of photons in a channel of radiance 1", at_least=1)
+    prior: str = fields.choice("total_variation", f"prior of the texture: {', '.join(_PRIORS)}", _PRIORS)
+
+    def texture(self) -> np.ndarray:
+        return _mosaic(self.texture_resolution)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        options: dict[str, dict[str, Any] | None] = {
+            "total_variation": {"total_variation": 0.05},
+            "palette": {"palette": np.concatenate([_COLOURS * shade for shade in _SHADES]), "std": 0.05},
+        }
+        return (Parameter("poster.bsdf.reflectance.data", initial=0.5, prior=options.get(self.prior)),)
+
+    def problem(self, name: str) -> Problem:
+        (view,) = views_of(load(self.scene), self)
+        counted = np.random.default_rng(0).poisson(self.photons * np.asarray(view.reference))
+        return build_problem(name, self, [replace(view, reference=(counted / self.photons).astype(np.float32))])
 
 
 @register(name="caustic", position=12)
@@ -132,7 +171,6 @@ def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any
 def _mosaic(resolution: int) -> np.ndarray:
     """Return rings of light and dark tiles in four colours, (resolution, resolution, 3)."""
     u, v = parts.grid(resolution)
-    colours = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
     x, y = np.floor(8 * u) - 3.5, np.floor(8 * v) - 3.5
-    tile = colours[(np.maximum(np.abs(x), np.abs(y)) + 2 * (np.abs(x) == np.abs(y))).astype(int) % 4]
-    return (tile * np.where((x + y) % 2 == 0, 1.1, 0.75)[..., None]).astype(np.float32)
+    tile = _COLOURS[(np.maximum(np.abs(x), np.abs(y)) + 2 * (np.abs(x) == np.abs(y))).astype(int) % 4]
+    return (tile * np.where((x + y) % 2 == 0, *_SHADES)[..., None]).astype(np.float32)

@@ -1,4 +1,5 @@
-"""Problems `two-planets`, `globe-and-mirror` and `three-textures`: painted bodies of adaptive pixel sampling (Figs 8, 9, 1 of its paper).
+"""Problems `two-planets`, `globe-and-mirror` and `three-textures`: painted bodies of adaptive pixel sampling (Figs 8, 9, 1 of its paper);
+and `one-jar`, painted too, in four worlds.
 
 `two-planets` is the exchange of two planets' textures. Light reaches the planet in the glass ball through two refractions, and no emitter
 can be sampled from it: its pixels are much noisier than the other's, at equal derivatives. `globe-and-mirror` is the earth under glass,
@@ -9,14 +10,20 @@ the ground, which contains almost no information about the paint. The sides in t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from unrender.core.geometry import rotation
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts
+from unrender.gallery.specification import build_problem, reference
 from unrender.preconditioners import LargeSteps
+from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0  # radii of the planets and of the two sides of the glass
 _APART = 1.05  # distance of each planet from the centre
@@ -167,6 +174,62 @@ class GlobeAndMirror(fields.Rendered):
 
 _NOON = parts.unit([0.45, 0.7, 0.55])  # direction to the sun
 _FROM_CENTRE = 0.72  # distance of each object from the centre
+_LAMPS = {"left": ([-2.0, 2.0, 2.0], (27.0, 24.0, 18.0)), "right": ([2.0, 1.5, 1.5], (18.0, 21.0, 27.0))}
+"""Positions and intensities of the lamps of `one-jar`."""
+
+
+@register(name="one-jar", position=36)
+@dataclass(frozen=True)
+class OneJar(fields.Rendered):
+    """The paint of a jar and a lamp's intensity, from four pictures: under either lamp, turned around, and outdoors.
+
+    Four views by one camera, each of a world of its own: the other lamp is off, the jar is turned by a known angle under both, or the scene
+    is another one, with a sky. The unknowns are the reflectance, texture_resolution² texels, initially grey, with LargeSteps, and the
+    intensity of the left lamp, (3,). Only the third picture shows the back of the jar. Those without the left lamp tell its intensity
+    from the paint.
+    """
+
+    texture_resolution: int = fields.texture_resolution(32)
+    reference_spp: int = fields.reference_spp(256)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the jar on the y axis, its foot at y = 0, under both lamps."""
+        return self._stage()
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter("jar.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),
+            Parameter("left.intensity.value", initial=12.0),
+        )
+
+    def problem(self, name: str) -> Problem:
+        def view(seen: Any, **world: Any) -> View:
+            return View(reference(load(seen), 0, self.reference_spp, self.max_depth), **world)
+
+        alone = [
+            view(partial(self._stage, dark=lamp), known={f"{lamp}.intensity.value": [0.0, 0.0, 0.0]}) for lamp in _LAMPS
+        ]
+        turned = view(partial(self._stage, turn=np.pi), known={"jar.rotation": [0.0, np.pi, 0.0]})
+        outdoors = partial(self._stage, outdoors=True)
+        return build_problem(name, self, [*alone, turned, view(outdoors, scene=outdoors)])
+
+    def _stage(self, dark: str = "", turn: float = 0.0, outdoors: bool = False) -> dict[str, Any]:
+        points = meshes.lathe(*_jar(32), 64) @ rotation((0, 1, 0), turn).T
+        lamps = {
+            name: {"type": "point", "position": place, "intensity": parts.colour(*(n * (name != dark) for n in colour))}
+            for name, (place, colour) in _LAMPS.items()
+        }
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 1.0, 3.2), (0, 0.42, 0), 26.0, self.resolution),
+            "ground": parts.rectangle((0, 0, 0), (9, 0, 0), (0, 0, -9), parts.diffuse(0.3)),
+            "jar": _painted("jar", points, parts.bitmap(parts.photograph("chelsea", self.texture_resolution))),
+            **(
+                {"sky": parts.environment(parts.picture(_NOON, np.radians(8.0), (45.0, 40.0, 32.0)))}
+                if outdoors
+                else lamps
+            ),
+        }
 
 
 @register(name="three-textures", position=31)

@@ -11,7 +11,7 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -156,13 +156,13 @@ class ProblemSource(Protocol):
         ...
 
 
-def build_problem(name: str, specification: Specification) -> Problem:
-    """Return the problem: true values from the scene, one view per sensor, references by Mitsuba's integrators."""
+def build_problem(name: str, specification: Specification, views: Sequence[View] = ()) -> Problem:
+    """Return the problem: true values from the scene, `views` or one view per sensor, references by Mitsuba's integrators."""
     ensure()
     renderer = MitsubaRenderer(specification.scene, specification.max_depth)
     parameters = specification.parameters()
     truth = {key: value.numpy() for key, value in renderer.values([p.key for p in parameters]).items()}
-    views = views_of(renderer.pair.current, specification)
+    views = views or views_of(renderer.pair.current, specification)
     return Problem(renderer, parameters, views, specification.loss, specification.max_depth, truth=truth, name=name)
 
 
