@@ -33,7 +33,7 @@ def test_resume_goes_on_and_says_so(unrender, stopped: Path):
     answer = unrender("resume", "result")
     assert answer.status == 0, answer.error
     assert "step 10/10" in answer.out
-    assert "resumed at step 6" in " ".join(answer.out.split())
+    assert "resumed after step 6" in " ".join(answer.out.split())
     assert f"page: {Path('result', 'report.html')}" in answer.out
     record = json.loads((stopped / "run.json").read_text())
     assert (record["status"], record["steps"], record["seed"], record["resumed"]) == ("finished", 10, 5, [6])

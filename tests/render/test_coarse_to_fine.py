@@ -369,7 +369,7 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
 def test_what_cannot_be_carried_starts_anew_and_says_so() -> None:
     found = problem(ur.scene.CoarseToFine((2,), states="carry"))
     result = ur.optimize(found, ur.PathGradient(spp=2), ur.optimizers.LBFGS(0.1), 5)
-    assert "step 2: LBFGSState cannot be carried to another resolution: it restarts" in result.warnings
+    assert "after step 2: LBFGSState cannot be carried to another resolution: it restarts" in result.warnings
     smoothed = ur.optimize(found, ur.SmoothedDerivatives(0.05, 8), ur.optimizers.CMAES(diagonal=True), 4)
     assert any("CMAESState" in line for line in smoothed.warnings)
     assert smoothed.parameters[KEY].shape == TRUTH.shape

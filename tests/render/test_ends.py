@@ -104,7 +104,7 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
     assert (written["status"], written["error"]) == ("failed", "stopped: the last gradients were not finite")
     first, last = result.warnings
     assert first == (
-        "step 5: the optimizer's step for rate (from its own state, or the preconditioner) was not finite; such steps are not applied"
+        "step 6: the optimizer's step for rate (from its own state, or the preconditioner) was not finite; such steps are not applied"
     )
     assert last.startswith("20 steps in a row were not finite: the run was stopped")
     assert reader.read(folder).record.status == "failed"
@@ -196,7 +196,7 @@ def test_a_failed_run_that_is_resumed_tries_again(tmp_path: Path, what: str, cul
     folder = tmp_path / "run"
     first = start(folder, 100, estimator=Spoilt(since=4, what=what))
     assert first.status == "failed"
-    assert first.warnings[0] == f"step 4: {culprit} was not finite; such steps are not applied"
+    assert first.warnings[0] == f"step 5: {culprit} was not finite; such steps are not applied"
     problem = ur.gallery.problem("exponential")
     again = ur.resume(folder, problem, steps=100, estimator=Spoilt(since=4, what=what))
     assert again.warnings == first.warnings

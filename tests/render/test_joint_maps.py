@@ -108,24 +108,32 @@ def test_a_run_that_is_too_short_for_the_test_says_so():
 BOARD = [f"wall.bsdf.{name}.data" for name in ("base_color", "metallic", "roughness")]
 
 
-def board(metallic: float) -> ur.Problem:
-    """A wall of equal texels before three lamps, each in a picture of its own."""
-    values = {"base_color": [0.5, 0.5, 0.5], "metallic": [metallic], "roughness": [0.5]}
+def board(**others: float) -> ur.Problem:
+    """A wall of equal texels before three lamps, each in a picture of its own. All its maps are unknown."""
+    values = {"base_color": [0.5, 0.5, 0.5]} | {name: [value] for name, value in others.items()}
     maps = {name: np.tile(np.array(x, np.float32), (TEXELS, TEXELS, 1)) for name, x in values.items()}
     bsdf = {name: {"type": "bitmap", "bitmap": mi.Bitmap(x), "raw": True} for name, x in maps.items()}
     names = [f"lamp{n}.intensity.value" for n in range(3)]
     reference = np.full((SIZE, SIZE, 3), 0.3, np.float32)
     views = [ur.View(reference, known={k: [9.0 * (k == name)] * 3 for k in names}) for name in names]
     described = {**scene(*WHITE), "wall": {"type": "rectangle", "bsdf": {"type": "principled", **bsdf}}}
-    return ur.Problem(described, [ur.Parameter(key) for key in BOARD], views, max_depth=2)
+    return ur.Problem(described, [ur.Parameter(f"wall.bsdf.{name}.data") for name in values], views, max_depth=2)
 
 
 @pytest.mark.parametrize("metallic", [0.0, 0.1])
 def test_values_at_a_bound_change_inwards(metallic: float):
     """The sign of an eigenvector is arbitrary: at a metallic map of 0 the change left the bounds, and roughness alone changed."""
-    made = board(metallic)
+    made = board(metallic=metallic, roughness=0.5)
     (line,) = hidden_changes(made, made.initial_values(), 16, math.inf)
     assert line.startswith(f"{BOARD[1]}, {BOARD[2]}: changes of one hide those of another")
+
+
+def test_a_texture_of_small_changes_is_not_named():
+    """Changes of a high roughness are hidden by changes of the colour that are a twelfth as large, and both were named."""
+    made = board(roughness=0.8)
+    (line,) = hidden_changes(made, made.initial_values(), 16, math.inf)
+    assert line.startswith(f"{BOARD[2]}: small changes of the surface's other textures hide its changes")
+    assert BOARD[0] not in line
 
 
 def test_surfaces_share_the_time(monkeypatch: pytest.MonkeyPatch):

@@ -51,10 +51,10 @@ def test_a_run_leaves_a_second_minimum(truth: float, start: float, tmp_path: Pat
     made = problem(truth, start)
     result = ur.optimize(made, steps=60, run_directory=tmp_path / "whole", checkpoint_every=20)
     assert result.parameters[KEY] == pytest.approx(truth, abs=0.01)
-    assert any("begins again at step 24" in line for line in result.adapted)
+    assert any("begins again after step 24" in line for line in result.adapted)
     assert not any("differs" in line for line in result.warnings)
     resumed = ur.resume(tmp_path / "whole", made, steps=61)
-    assert any("begins again at step 24" in line for line in resumed.adapted)
+    assert any("begins again after step 24" in line for line in resumed.adapted)
     assert resumed.parameters[KEY] == pytest.approx(truth, abs=0.01)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 import time
 from pathlib import Path
@@ -114,7 +116,52 @@ def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
     (line,) = (line for line in found.warnings if "allows about" in line)
     assert "fewer samples (--set spp=" in line
     assert "pixels=4096" not in line  # the view has 16 pixels
-    assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
+    assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=8).warnings
+
+
+@pytest.mark.parametrize(("steps", "words"), [(1, "1 step is"), (7, "7 steps are"), (8, "")])
+@pytest.mark.parametrize("saved", [False, True])
+def test_too_few_steps_to_judge_are_told(steps: int, words: str, saved: bool, tmp_path: Path) -> None:
+    """Such runs ended as finished, without a word. Unknowns with standard errors have been judged, as in a run folder."""
+    given = ur.PathGradient(), ur.optimizers.Adam(0.01), steps
+    found = ur.optimize(problem(), *given, run_directory=tmp_path / "run" if saved else None)
+    judged = bool(found.standard_error) or any("it settled" in line for line in found.warnings)
+    assert judged is saved
+    lines = [line for line in found.warnings if "too few" in line]
+    expected = f"{words} too few to judge whether gain converged: give more steps"
+    assert lines == [expected] * bool(words and not saved)
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_end_of_a_number_of_steps_does_not_depend_on_the_clock(
+    interrupted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that goes five times as far with each look gave other pictures and left tests out; so did a resumed run."""
+
+    class Interrupt(Callback):
+        def on_step(self, run: Run, record: dict[str, Any]) -> None:
+            if run.step == 20 and interrupted:
+                raise KeyboardInterrupt
+
+    ends = []
+    for pace in (0.01, 0.05):
+        clock = itertools.count(0.0, pace)
+        monkeypatch.setattr(time, "perf_counter", lambda clock=clock: next(clock))
+        given = ur.PathGradient(), ur.optimizers.Adam(0.02), 40
+        folder, stops = tmp_path / str(pace), [Interrupt()] * (pace > 0.01)
+        with contextlib.suppress(KeyboardInterrupt):
+            end = ur.optimize(problem(), *given, callbacks=stops, run_directory=folder, checkpoint_every=8)
+        if interrupted and stops:
+            end = resume_run(load_run(folder), problem())
+            assert end.resumed == [16]
+        ends.append(end)
+    first, last = ends
+    assert first.verification == last.verification
+    assert first.image_errors == last.image_errors
+    for name in ("warnings", "undetermined", "without_errors"):
+        assert list(getattr(first, name)) == list(getattr(last, name))
+    for name in ("parameters", "standard_error"):
+        np.testing.assert_array_equal(getattr(first, name)["gain"], getattr(last, name)["gain"])
 
 
 def test_a_budget_of_few_steps_is_told_at_the_end_if_the_first_were_quick(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,7 +84,7 @@ def test_values_with_their_errors_in_words(value: float, error: float, text: str
     ("value", "error", "text"),
     [
         (0.0018, 0.0019, "0.0018 ± 0.0019"), (-0.0005, 0.0019, "−0.0005 ± 0.0019"), (0.0, 0.02, "0.000 ± 0.020"), (0.3, 0.0, "0.3"),
-        (-2e-8, 3e-8, "−2·10⁻⁸ ± 3·10⁻⁸"), (math.inf, 1.0, "∞"), (0.215, 5.9e-11, "0.215"),
+        (-2e-8, 3e-8, "−2·10⁻⁸ ± 3·10⁻⁸"), (math.inf, 1.0, "∞"), (0.215, 5.9e-11, "0.215"), (0.5, 2e-7, "0.5 ± 2·10⁻⁷"),
     ],
 )  # fmt: skip
 def test_values_within_their_standard_error_are_no_limit(value: float, error: float, text: str) -> None:

@@ -168,7 +168,7 @@ def test_final_pictures_take_a_twentieth_of_the_time(
         return np.zeros((*SHAPE, 3), np.float32)
 
     monkeypatch.setattr(final_images, "render", render)
-    monkeypatch.setattr(final_images.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(final_images.timing, "now", lambda: now[0])
     values = {"wall": np.full(3, 0.4, np.float32)}
     found = final_images.render_final_images(made, Result(values, values, [], seconds, 0.0, "steps"))
     allowed = max(seconds / 20, slow)
@@ -697,7 +697,7 @@ def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
 
     monkeypatch.setattr(final_images, "render", render)
     monkeypatch.setattr(final_images, "unexplained_pixels", check)
-    monkeypatch.setattr(final_images, "time", SimpleNamespace(perf_counter=lambda: spent[0]))
+    monkeypatch.setattr(final_images.timing, "now", lambda: spent[0])
     result = Result(values, values, [{}] * 20, 100.0, 0.0, "steps", verification={"best": "end"})
     final_images.render_final_images(made, result, spp, left=lambda: budget - spent[0], tested=False)
     assert checked is (checks[0] > 0.0)

@@ -404,7 +404,7 @@ def test_a_shortened_step_is_told_beside_that_of_a_mesh_whose_name_ends_alike() 
     run: Any = SimpleNamespace(problem=SimpleNamespace(unknowns=made), step=3, warnings=[])
     for keys in (("bigball",), ("ball",), ("ball", "bigball")):
         loop._warn_of_shortened(run, keys)
-    assert [line.partition(": tri")[0] for line in run.warnings] == ["step 3: bigball", "step 3: ball"]
+    assert [line.partition(": tri")[0] for line in run.warnings] == ["step 4: bigball", "step 4: ball"]
 
 
 def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step() -> None:

@@ -14,6 +14,7 @@ LISTED = 4
 _MOST_LISTED = 12
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
+_ROUNDING = 2.0**-24  # relative rounding error of float32
 
 
 def number(value: float | None) -> str:
@@ -100,7 +101,7 @@ def with_error(value: float, error: float) -> str:
 
 def with_standard_error(value: float, error: float) -> str:
     """Format a value, which may be negative, with its standard error, if that is finite and no rounding: 0.0018 ± 0.0019."""
-    if not (math.isfinite(value) and math.isfinite(error)) or error <= 1e-6 * abs(value):
+    if not (math.isfinite(value) and math.isfinite(error)) or error <= _ROUNDING * abs(value):
         return number(value)
     places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error
     if abs(value) >= 1e5 or error < 1e-6:

@@ -9,11 +9,12 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from unrender.backend import cache
+from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs.callbacks import Callback
-from unrender.runs.result import NON_FINITE
+from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.truth_check import FEW_NEWTON_STEPS
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _LEAST_SHARE = 0.5
 _LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
 """Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
 _PAGE_SECONDS = 1.0  # time of the page and the summary on an idle machine
+_OF_STEP = 2  # cost of a path of a step, and launches of a step, relative to a rendering: most steps have an adjoint
 _MOST_STEPS = 1 << 63  # exclusive limit that the files of a run folder can store
 
 
@@ -87,7 +89,10 @@ class Budget(Callback):
 
 
 def slowdown() -> float:
-    """Return the time of this process over that on an idle machine, >= 1, from the waits of its threads; 1 if unknown."""
+    """Return the time of this process over that on an idle machine, >= 1, from the waits of its threads; 1 if unknown, or not needed since
+    renderings are counted."""
+    if timing.counts():
+        return 1.0
     running = waiting = 0
     for path in glob.glob("/proc/self/task/*/schedstat"):
         try:
@@ -97,6 +102,13 @@ def slowdown() -> float:
             continue
         running, waiting = running + ran, waiting + waited
     return 1.0 + waiting / running if running else 1.0
+
+
+def seconds_of_steps(result: Result) -> float:
+    """Return the seconds of a run's steps, on the clock of `timing`."""
+    if not timing.counts():
+        return result.seconds
+    return timing.cost(_OF_STEP * result.history[-1]["samples"], _OF_STEP * result.steps) if result.history else 0.0
 
 
 def _warn_of_few_steps(run: Run) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 
+from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
@@ -92,7 +92,7 @@ def undetermined(
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
         errors: {key: array}, standard errors of the values.
     """
-    known, lines, longest, began = problem.renderer.parameters(), [], 0.0, time.perf_counter()
+    known, lines, longest, began = problem.renderer.parameters(), [], 0.0, timing.now()
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
     until = {True: began + max(seconds, most), False: began + seconds}
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
@@ -104,7 +104,7 @@ def undetermined(
         ranged = low is not None and high is not None and info.role in _ROLES
         if info.rigid or info.viewpoint or info.welded or not (ranged or (key not in errors and _moved(initial, own))):
             continue
-        started = time.perf_counter()
+        started = timing.now()
         if longest > 0.0 and started + longest > until[key in unseen]:
             break
         ends = [own, initial]
@@ -120,7 +120,7 @@ def undetermined(
                 change = change_of_images(problem, first, detailed, spp, per_pass)
         except InputError:  # the renderer rejects a value at the end of the range
             continue
-        longest = max(longest, time.perf_counter() - started)
+        longest = max(longest, timing.now() - started)
         if line := _words(hidden, change, ranged, bounded):
             lines.append(f"{key}: {line}")
     return lines
@@ -181,9 +181,9 @@ def common_factor(
     tests = _products(problem)
     if not tests:
         return []
-    least, started = min(per_pass or spp, spp), time.perf_counter()
+    least, started = min(per_pass or spp, spp), timing.now()
     render(problem, values, 0, least, _SEEDS[0], per_pass)
-    needed = len(tests) * _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started)
+    needed = len(tests) * _RENDERINGS * len(selected_views(problem)) * (timing.now() - started)
     if needed > max(seconds, most):
         return untested_factor(problem)
     spp = max(least, power_of_two(int(min(spp, least * seconds / needed))))
@@ -306,7 +306,7 @@ def with_lost(
     for key in keys:
         if remaining() <= longest:
             break
-        began, path = time.perf_counter(), np.asarray(end[key], np.float64) - start[key]
+        began, path = timing.now(), np.asarray(end[key], np.float64) - start[key]
         away = np.where(path < 0.0, -1.0, 1.0)  # a step towards the start might end there
         near = {**end, key: changed(problem, key, end[key], away, least=_root_mean_square(path))}
         try:
@@ -316,7 +316,7 @@ def with_lost(
                 lost += [key] * hidden
         except InputError:  # the renderer rejects a value
             continue
-        longest = max(longest, time.perf_counter() - began)
+        longest = max(longest, timing.now() - began)
     if not lost:
         return difference
     explanation = (

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from unrender.core import timing
 from unrender.core.random import Key
 from unrender.rendering.renderer import RenderSession
 from unrender.runs.image_sensitivity import MAP_AXES, adjoint_spp, adjoints, around, derivative_session
@@ -90,7 +90,7 @@ def add_field_directions(
     parts: list[Differences] = []
     longest = 0.0
     for index in range(_ROUNDS):
-        started = time.perf_counter()
+        started = timing.now()
         if not len(targets) or started + longest > until:
             break
         directions = adjoints.of(targets)
@@ -107,7 +107,7 @@ def add_field_directions(
         before, squares = squares, remainder.squares()[0]
         active = active[squares[active] < _SHRINKS * before[active]]
         targets = remainder.average()[active]
-        longest = max(longest, time.perf_counter() - started)
+        longest = max(longest, timing.now() - started)
     if not parts:
         return None
     missing = "" if not len(targets) else _UNRESOLVED if len(parts) == _ROUNDS else _LATE

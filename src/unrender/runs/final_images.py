@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from unrender.core import phases
+from unrender.core import phases, timing
 from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
-from unrender.runs.budget import MOST_SLOWDOWN, slowdown
+from unrender.runs.budget import MOST_SLOWDOWN, seconds_of_steps, slowdown
 from unrender.runs.determination import (
     common_factor,
     undetermined,
@@ -133,13 +132,13 @@ def render_final_images(
     """
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
-        chosen, began = _chosen(problem), time.perf_counter()
+        chosen, began = _chosen(problem), timing.now()
         pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
-        spent, ends = time.perf_counter() - began, halves_of["result"]
+        spent, ends = timing.now() - began, halves_of["result"]
         if risen := rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=risen)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
-        seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
+        seconds = min(_SENSITIVITY_SHARE * max(_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
@@ -244,12 +243,12 @@ def _undetermined(
     if not result.steps:
         return [], (), {}, []
     lines = undetermined_cells(sensitivities)
-    seconds = min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
+    seconds = min(max(_LOOK_SHARE * seconds_of_steps(result), _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
     slow = min(slowdown(), MOST_SLOWDOWN)
-    allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
+    allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
@@ -356,12 +355,12 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
     most, trial = _most_spp(problem), _pass_spp(problem)
     seconds = 0.0
     for seed in (0, 1):  # the first rendering compiles kernels
-        started = time.perf_counter()
+        started = timing.now()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
-        seconds = time.perf_counter() - started
+        seconds = timing.now() - started
     check = min(_cost_of_check(problem), _MOST_CHECK)
     least = _LEAST_SECONDS * min(slowdown(), MOST_SLOWDOWN)
-    allowed = min(max(_SHARE * result.seconds, least), most_seconds / (1.0 + check))
+    allowed = min(max(_SHARE * seconds_of_steps(result), least), most_seconds / (1.0 + check))
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
     return max(2, 2 * trial, power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 

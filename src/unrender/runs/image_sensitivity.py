@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, checks, periodic
+from unrender.core import arrays, checks, periodic, timing
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
@@ -23,6 +22,8 @@ from unrender.scene.render import as_tree, selected_views, view_request
 from unrender.statistics.debiased import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
+ADJOINT = 1.5
+"""Time of an adjoint relative to a rendering."""
 MAP_AXES = 3
 """Number of axes from which a parameter is a texture or grid."""
 FEWEST_PROBES = 8
@@ -146,8 +147,8 @@ def curvature(
     maps = [key for key, square in squares.items() if square.ndim >= MAP_AXES]
     stored: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
     most = min(_PROBES, _PROJECTIONS // max(1, sum(squares[key].size for key in maps)))
-    made, until = 0, time.perf_counter() + seconds
-    while made == 0 or (made < probes and time.perf_counter() < until):
+    made, until = 0, timing.now() + seconds
+    while made == 0 or (made < probes and timing.now() < until):
         one, other = (
             _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views, noise)
             for half in range(2)
@@ -341,6 +342,7 @@ def adjoints(
     for (view, seed), parts in zip(seeds.items(), pictures, strict=True):
         rendering = session.image(parameters, view_request(problem, view, spp, seed.uint32()))
         shape = arrays.shape(rendering.images)
+        timing.add((1.0 + ADJOINT * count) * spp * math.prod(problem.sizes[view]), 1 + count)
         for index, part in enumerate(parts):
             weights = problem.renderer.array(part.astype(np.float32).reshape(shape))
             gradient = session.adjoint(parameters, rendering.paths, weights)

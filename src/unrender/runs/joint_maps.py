@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
 
+from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.runs.determination import change_of_images, changed
 from unrender.runs.image_sensitivity import (
+    ADJOINT,
     MAP_AXES,
     adjoint_spp,
     adjoints,
@@ -32,13 +33,13 @@ _SLOT = re.compile(r"\.(?:(?:nested_)?b(?:sdf|rdf)(?:_\d+)?|emitter)\.")
 """Name of a material within a shape or another material, or of a shape's emitter."""
 _HIDDEN = 0.35
 """Root mean square change of the images by changes together, relative to the same changes alone, below which they hide one another."""
-_EXPECTED, _NAMED = 0.5, 0.2
-"""The same ratio by the derivatives, from which nothing is rendered; least part of a named texture, relative to the largest one."""
+_EXPECTED, _NAMED, _LARGE = 0.5, 0.2, 0.1
+"""The same ratio by the derivatives, from which nothing is rendered; least part of a named texture, relative to the largest one, and least
+change of its values. A smaller change is a small error, even if that of another texture is as large as its range."""
 _STEP, _TURN = 0.2, 0.02
 """Size of the changes relative to those of `changed`, a fiftieth of the range; turn of normals, in units of a normal map."""
-_STREAM, _LAUNCHES, _RENDERINGS, _ADJOINT = 9, 4, 4, 1.5
-"""Stream of the random numbers, adjoints of each change, samples of a rendering of the joint change relative to those of a part, and time
-of an adjoint relative to such a part's rendering."""
+_STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
+"""Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
 
 
 def hidden_changes(
@@ -56,10 +57,10 @@ def hidden_changes(
         seconds: time limit of the tests of all surfaces together.
         per_pass: see `render`.
     """
-    lines, until = [], time.perf_counter() + seconds
+    lines, until = [], timing.now() + seconds
     for keys in _surfaces(problem):
         try:
-            lines += _Surface(problem, values, keys, spp, per_pass).line(until - time.perf_counter())
+            lines += _Surface(problem, values, keys, spp, per_pass).line(until - timing.now())
         except InputError:  # the renderer rejects a value
             continue
     return lines
@@ -108,7 +109,7 @@ class _Surface:
 
     def line(self, seconds: float) -> list[str]:
         """Return the line; [] for none."""
-        problem, values, started = self.problem, self.values, time.perf_counter()
+        problem, values, started = self.problem, self.values, timing.now()
         fields = [(key, field) for key in self.keys for field in self._fields(key)]
         matrix = self._matrix(fields, seconds)
         if matrix is None:
@@ -128,13 +129,15 @@ class _Surface:
         total = sum(parts.values())
         joint = float(np.einsum("hwi,hwij,hwj->", amounts, matrix, amounts))
         named = [key for key, part in parts.items() if part > _NAMED**2 * max(parts.values())]
+        sizes = self._sizes(fields, amounts, matrix)
+        weak = [key for key in named if sizes[key] > _LARGE * max(sizes[k] for k in named)]
         if not total > 0.0 or joint > _EXPECTED**2 * total or not (len(named) > 1 or self._is_normal(named[0])):
             return []
         moved = {**values, **after}
         alone = total / (3.0 * sum(float(np.sum(problem.test_weights(view))) for view in range(len(problem.views))))
-        rendered = time.perf_counter()
+        rendered = timing.now()
         change = change_of_images(problem, values, moved, _RENDERINGS * self.spp, self.per_pass)
-        now = time.perf_counter()
+        now = timing.now()
         may_be = change.square < _HIDDEN**2 * alone < change.square + 2.0 * change.error
         if may_be and now - started + _RENDERINGS * (now - rendered) < seconds:
             change = change_of_images(problem, values, moved, _RENDERINGS**2 * self.spp, self.per_pass)
@@ -147,9 +150,12 @@ class _Surface:
                 f"{named[0]}: some turns of its normals change the pictures by {ratio} of what others do; its values may be another "
                 f"solution: {advice}"
             ]
+        hidden, whose = f"{listed(weak)}: changes of one hide those of another", "their"
+        if len(weak) == 1:
+            hidden, whose = f"{weak[0]}: small changes of the surface's other textures hide its changes", "its"
         return [
-            f"{listed(named)}: changes of one hide those of another; together they change the pictures by {ratio} of what they do alone; "
-            f"their values may be another solution: {advice}, or fix one of them"
+            f"{hidden}; together they change the pictures by {ratio} of what they do alone; {whose} values may be another solution: "
+            f"{advice}, or fix one of them"
         ]
 
     def _within(
@@ -167,6 +173,17 @@ class _Surface:
             left, whole = (np.square(x).sum(axis=axes) for x in (after[key] - before, step))
             parts[key] = float(np.sum(squares.mean(axis=axes) * diagonal[own] * left / np.maximum(whole, 1e-300)))
         return after, parts
+
+    def _sizes(
+        self, fields: Sequence[tuple[str, np.ndarray]], amounts: np.ndarray, matrix: np.ndarray
+    ) -> dict[str, float]:
+        """Return the root mean square of each texture's amounts, which are relative to its range, over the cells that the images show."""
+        seen = np.maximum(np.trace(matrix, axis1=-2, axis2=-1), 0.0)
+        squares = np.einsum("hw,hwf->f", seen / max(float(seen.sum()), 1e-300), np.square(amounts))
+        return {
+            k: math.sqrt(np.mean([x for x, (key, _) in zip(squares, fields, strict=True) if key == k]))
+            for k in self.keys
+        }
 
     def _is_normal(self, key: str) -> bool:
         return self.problem.renderer.parameters()[key].role == "normal"
@@ -187,13 +204,13 @@ class _Surface:
     def _matrix(self, fields: Sequence[tuple[str, np.ndarray]], seconds: float) -> np.ndarray | None:
         """Return the matrix of each cell, (h, w, F, F); None if there is not enough time."""
         problem, values, key = self.problem, self.values, Key(0, _STREAM)
-        views, started = range(len(problem.views)), time.perf_counter()
+        views, started = range(len(problem.views)), timing.now()
 
         def pictures(of: Mapping[str, np.ndarray]) -> list[np.ndarray]:
             return [render(problem, of, view, self.spp, key.uint32(), self.per_pass) for view in views]
 
         before = pictures(values)
-        if ((1 + _ADJOINT * _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (time.perf_counter() - started) > seconds:
+        if ((1 + ADJOINT * _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (timing.now() - started) > seconds:
             return None
         moved = [pictures({**values, name: np.asarray(values[name] + x, np.float32)}) for name, x in fields]
         changes = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
@@ -91,7 +91,7 @@ def check_numbers(
     if numbers is None or not compares(problem):
         return NumbersCheck()
     numbers = replace(numbers, weights=weights)
-    until = time.perf_counter() + seconds
+    until = timing.now() + seconds
     try:
         return _of_tested_views(_check(numbers, sensitivities, until), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
@@ -131,11 +131,11 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     key, change = Key(0, 0, _STREAM), _SHIFT * numbers.slope()
     widths, longest = _FIRST_WIDTH * numbers.limits, 0.0
     for index in range(_PASSES + 1):
-        started = time.perf_counter()
+        started = timing.now()
         if started + longest > until:
             return NumbersCheck(unchecked=numbers.keys)
         differences = numbers.differences(np.diag(widths), key.fold(index))
-        longest = time.perf_counter() - started
+        longest = timing.now() - started
         if index < _PASSES:
             squares, errors = differences.squares()
             changes = np.sqrt(np.maximum(squares, errors) / differences.one[0].size)
@@ -150,7 +150,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
     moved, fixed = fields_of(numbers, sensitivities)
     if moved:
-        now = time.perf_counter()
+        now = timing.now()
         half = now + 0.5 * (until - now) if math.isfinite(until) else until
         extended = add_field_directions(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
         if extended is None:
@@ -159,7 +159,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         fixed |= dict.fromkeys(moved, missing) if missing else {}
     directions, length = _directions(differences, numbers.limits, change)
     for index in range(_ROUNDS):  # short differences hardly tell weak directions from their sums with others
-        if length > _WEAK or time.perf_counter() + 4.0 * longest > until:
+        if length > _WEAK or timing.now() + 4.0 * longest > until:
             break
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
         directions, length = _directions(again, numbers.limits, change)
@@ -189,7 +189,7 @@ def _repeated(
     residuals, before = np.zeros((2, *references.shape)), np.zeros((2, *references.shape))
     began = np.append(numbers.start, numbers.point[numbers.count :])[None]
     differences = None
-    while differences is None or (repeats < _REPEATS and time.perf_counter() < until):
+    while differences is None or (repeats < _REPEATS and timing.now() < until):
         own = key.fold(_PASSES + 1 + repeats)
         more = numbers.differences(directions, own)
         # The end of a long difference may have rare bright samples, such as at a low roughness; repeats that have them count less.

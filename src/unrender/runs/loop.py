@@ -191,7 +191,7 @@ def _not_finite(estimate: Estimate) -> str:
 
 def _warn_once(run: Run, line: str) -> None:
     if not any(known.endswith(f": {line}") for known in run.warnings):
-        run.warnings.append(f"step {run.step}: {line}")
+        run.warnings.append(f"step {run.step + 1}: {line}")
 
 
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from unrender.core import timing
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
@@ -118,7 +118,7 @@ def uncertainty(
     """
     values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
     check_arguments("uncertainty", problem, values or {}, seconds, seed)
-    known, maps, until = Curvature(), Uncertainty(), time.perf_counter() + seconds
+    known, maps, until = Curvature(), Uncertainty(), timing.now() + seconds
     keys, mapped = checked_keys(problem, values, problem.initial_values()), map_keys(problem)
     if mapped or keys:
         views = range(len(problem.views)) if mapped else selected_views(problem)
@@ -130,7 +130,7 @@ def uncertainty(
             known = curvature(problem, values, seconds=seconds, seed=seed, noise=noise)
         if mapped:
             maps = of_residuals(problem, values, halves, known, seed)
-    left = until - time.perf_counter()
+    left = until - timing.now()
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity(), weights)
     errors = {**numbers.standard_errors(values), **maps.standard_error}
     others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.elsewhere, *numbers.fixed})

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, timing
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.rendering.renderer import RenderSession, SampleRequest
@@ -211,6 +211,7 @@ class Numbers:
             request = SampleRequest(self.problem.views[view].sensor, self.spp, key.fold(view).uint32())
             images = arrays.numpy(session.image_batch(batch, request)).astype(np.float64)
             parts.append(images.reshape(count, -1, 3) * self.roots(view))
+            timing.add(self.spp * (images.size // 3))
         return np.concatenate(parts, axis=1)
 
     def by_view(self, pictures: np.ndarray) -> list[np.ndarray]:

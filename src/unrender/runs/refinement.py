@@ -86,7 +86,7 @@ def refine(run: Run) -> float:
         try:
             after = upsampled(component, upsampler) if carry[name] else restarted(component, new)
         except NotCarried as error:
-            run.warnings.append(f"step {run.step}: {error} cannot be carried to another resolution: it restarts")
+            run.warnings.append(f"after step {run.step}: {error} cannot be carried to another resolution: it restarts")
             after = restarted(component, new)
         setattr(state, name, after)
     state.noise = GradientNoise()
@@ -165,7 +165,7 @@ class MeshRefinement(Callback):
             try:
                 mesh = remeshing.apply(vertices, run.problem.faces[key], run.problem.texture_coordinates(key))
             except InputError as error:
-                run.warnings.append(f"step {run.step}: {key}: {error}; the mesh is unchanged")
+                run.warnings.append(f"after step {run.step}: {key}: {error}; the mesh is unchanged")
                 continue
             meshes[key] = mesh
             self._made[key] = len(mesh.faces)
@@ -195,7 +195,7 @@ class MeshRefinement(Callback):
 _USED, _FEWEST_STEPS = 0.4, 16  # fraction of the budget, and number of steps, after which values are compared once
 _SHARE, _LEAST_PATHS, _MOST_SHARE = 0.5, 1 << 14, 2.5
 """Paths of all pictures relative to the run's so far, the least number of one, and the share above which a short run is not compared."""
-BEGUN_AGAIN = "begins again at step"
+BEGUN_AGAIN = "begins again after step"
 """First words of the line about other values."""
 _NUMBER, _KEPT = 4, "kept"  # index of the set of random numbers; outcome of a comparison without a better place
 

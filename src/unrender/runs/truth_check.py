@@ -1,9 +1,10 @@
-"""Warnings about parameters whose error against the known truth has grown."""
+"""Warnings about parameters whose error against the known truth has grown, and about runs of few steps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from unrender.methods.rules.starts import exchangeable_pairs
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, root_of_covariance, seen_cells
+from unrender.runs.result import Result
 from unrender.runs.verification import misfit
 from unrender.scene.problem import Problem
 
@@ -36,6 +38,18 @@ _SIGNS_SEED, _DRAWS = 5, 8
 def has_few_steps(steps: int, optimizer: Optimizer) -> bool:
     """Return whether a run is unfinished; a Gauss-Newton step solves for all unknowns, so few of them may converge."""
     return steps < (FEW_NEWTON_STEPS if isinstance(optimizer, AveragedNewton) else FEW_STEPS)
+
+
+def with_few_steps(problem: Problem, result: Result) -> Result:
+    """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them."""
+    unknown = [key for key in problem.unknowns if key not in result.standard_error]
+    lines = (*result.warnings, *result.undetermined)
+    told = any(words in line for words in ("more steps", "more seconds", "of at least") for line in lines)
+    if result.status != "finished" or told or not unknown or not 0 < result.steps < FEW_NEWTON_STEPS:
+        return result
+    steps = "1 step is" if result.steps == 1 else f"{result.steps} steps are"
+    line = f"{steps} too few to judge whether {listed(unknown)} converged: give more steps"
+    return replace(result, warnings=[*result.warnings, line])
 
 
 def further_from_truth(

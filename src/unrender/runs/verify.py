@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.core import phases
+from unrender.core import phases, timing
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.runs import callbacks
+from unrender.runs.budget import seconds_of_steps
 from unrender.runs.callbacks import Callback
 from unrender.runs.earlier_image import (
     FIRST_CANDIDATE,
@@ -30,7 +31,7 @@ from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged, normalised
 from unrender.runs.result import INTERRUPTED, TERMINATED, Result
 from unrender.runs.run import Candidate
-from unrender.runs.truth_check import further_from_truth, has_few_steps
+from unrender.runs.truth_check import further_from_truth, has_few_steps, with_few_steps
 from unrender.runs.verification import (
     Memory,
     Misfit,
@@ -120,8 +121,9 @@ class Verify(Callback):
         if result.stopped in (INTERRUPTED, TERMINATED) or not result.steps:
             return result
         started = time.perf_counter()
-        with phases.phase(callbacks.VERIFYING):
+        with phases.phase(callbacks.VERIFYING), timing.counting(run.seconds is None):
             result = normalised(run.problem, self._verified(run, result))
+        result = with_few_steps(run.problem, result) if run.folder is None else result  # a folder has more tests
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:
@@ -129,11 +131,9 @@ class Verify(Callback):
         began = time.perf_counter()
         result, last, unaveraged = _end(run, result, pictures)
         seconds = time.perf_counter() - began
-        candidate = None if _other_meshes(problem) else run.state.candidate
-        if candidate is not None and (candidate.step == result.steps or candidate.loss >= last.loss[0]):
-            candidate = None
         memory, candidate_picture = _memory(run, pictures, last), None
-        if candidate is not None:
+        candidate = None if _other_meshes(problem) else run.state.candidate
+        if candidate is not None and not (candidate.step == result.steps or candidate.loss >= last.loss[0]):
             candidate_picture = self._candidate_picture(pictures, candidate)
         judged = self._judged(run, result, pictures, (first, last), seconds)
         worse = _is_worse(pictures, first, last) or judged[0] is not first
@@ -158,7 +158,7 @@ class Verify(Callback):
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             errors = {} if places else result.standard_error
-            lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds, errors)
+            lines += further_from_truth(problem, pictures, result.initial, ends, few, seconds_of_steps(result), errors)
         lines += _lines(*judged, best, best_loss[0], memory if disagrees else None, worse)
         spp = pictures.paths / (pictures.pixels * len(last.images[0]))
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])

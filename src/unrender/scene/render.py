@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, timing
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
@@ -60,6 +60,7 @@ def render(
         take = min(per_pass, spp - done)
         request = view_request(problem, view, take, key.fold(done).uint32())
         total += take * arrays.numpy(session.image(point, request).images[0]).reshape(total.shape)
+        timing.add(take * height * width)
         done += take
     return (total / spp).astype(np.float32)
 

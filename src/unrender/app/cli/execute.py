@@ -164,7 +164,7 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     if result.skipped:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
     if result.resumed:
-        table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
+        table.add_row("resumed", f"after step {', '.join(map(str, result.resumed))}")
     if result.pictures:
         first, last = (image_error(result, which) for which in ("initial", "result"))
         where = " where masks count" if any(view.mask is not None for view in problem.views) else ""
@@ -191,6 +191,9 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)
+    if few:
+        errors = ", ± their standard errors" if any("±" in text for text in few.values()) else ""
+        console.say(f"Rows with = have the values of the result{errors}.")
     for line in result.adapted:
         if line.startswith(BEGUN_AGAIN):
             console.say(f"note: the run {line}")

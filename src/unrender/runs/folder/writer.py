@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unrender.backend.versions import deciding_versions
-from unrender.core import phases
+from unrender.core import phases, timing
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
@@ -52,7 +52,7 @@ from unrender.runs.folder.schema import (
 )
 from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.result import TERMINATED, Result
-from unrender.runs.truth_check import has_few_steps
+from unrender.runs.truth_check import has_few_steps, with_few_steps
 from unrender.runs.verification import fit_status
 from unrender.scene import serialization
 
@@ -184,10 +184,11 @@ class RunWriter(Callback):
             started = time.perf_counter()
             complete = isinstance(run.optimizer, Measuring)
             given = self.final_spp, run.time_left, self._tested, result.pixel_weights, complete
-            images = render_final_images(run.problem, result, *given)
-            if images.rise:
-                result = at_start(result, images.rise)
+            with timing.counting(run.seconds is None):
                 images = render_final_images(run.problem, result, *given)
+                if images.rise:
+                    result = at_start(result, images.rise)
+                    images = render_final_images(run.problem, result, *given)
             result, verification = with_misfit(result, images.misfit), dict(result.verification)
             if verification and verification["status"] in ("finished", MISFIT):
                 few = has_few_steps(result.steps, run.optimizer)
@@ -204,6 +205,7 @@ class RunWriter(Callback):
                 warnings=[*result.warnings, *images.warnings],
                 verification=verification,
             )
+            result = with_few_steps(run.problem, result)
             result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
         self._guarded("meshes", lambda: write_files(self.folder, run.problem, result.parameters))
