@@ -197,7 +197,8 @@ def test_a_few_steps_of_every_pair(estimator: str, optimizer: str) -> None:
         ur.optimize(problem(views=2), ESTIMATORS[estimator](), OPTIMIZERS[optimizer](), steps=4, seed=5)
         for _ in range(2)
     )
-    assert (found.steps, found.stopped, found.skipped, found.warnings) == (4, "steps", 0, [])
+    assert (found.steps, found.stopped, found.skipped) == (4, "steps", 0)
+    assert all(line.startswith("4 steps are too few to judge") for line in found.warnings)
     assert any((value != found.initial[key]).any() for key, value in found.parameters.items())
     for key, value in found.parameters.items():
         assert value.shape == found.initial[key].shape
