@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import STEPS, STEPS_OF_FEW, Misfit, compares, misfit, prior_cause
+from unrender.runs.verification import NOISE, STEPS, STEPS_OF_FEW, Misfit, compares, misfit, prior_cause
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
@@ -143,8 +143,14 @@ def no_improvement(
     step, fall = change.get("step", 0), change.get("loss", (None, None))
     still = None not in fall and stays(loss, step, *fall)
     of = residuals[0::2], residuals[1::2], references, weights, sizes
-    differs = misfit(*of, least_difference(step) if still else _OF_PICTURE_FALLING)
-    return unexplained(problem, differs, step, steps, still) if differs else None
+    differs = misfit(*of, least_difference(step) if still else _OF_PICTURE_FALLING, by_pixel=True)
+    if differs is None:
+        return None
+    found = unexplained(problem, differs, step, steps, still)
+    if not found.by_pixel:
+        return found
+    words = found.explanation.replace(": ", ": the references may be noisy, or ", 1)
+    return replace(found, explanation=words, causes=(*found.causes, NOISE))
 
 
 def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays: bool = True) -> Misfit:

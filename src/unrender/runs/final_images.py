@@ -303,12 +303,14 @@ def _without_gradient(
     ends: Sequence[tuple[np.ndarray, ...]],
     spp: int,
 ) -> list[str]:
-    """Return `no_better_maps` of the textures and grids without a sensitivity, with the random numbers of the result's final images."""
+    """Return `no_better_maps` of the textures, grids and meshes without a sensitivity, with the random numbers of the result's final
+    images."""
 
     def halves(values: Mapping[str, np.ndarray], view: int) -> tuple[np.ndarray, ...]:
         return _picture(problem, values, view, spp, _SEEDS["result"])[0]
 
-    keys = [key for key in map_keys(problem) if key not in sensitivities] if result.steps else []
+    meshes = problem.faces if problem.remeshed_from is None else {}
+    keys = [key for key in (*map_keys(problem), *meshes) if key not in sensitivities] if result.steps else []
     return no_better_maps(problem, result, keys, ends, halves)
 
 

@@ -1,4 +1,4 @@
-"""Textures and grids without a path gradient: whether a run has brought their pictures closer to the references."""
+"""Textures, grids and meshes without a path gradient: whether a run has brought their pictures closer to the references."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from unrender.runs.determination import changed
 from unrender.runs.result import Result
-from unrender.runs.verification import compares, residuals_of_views
+from unrender.runs.verification import compares, misfit, residuals_of_views
 from unrender.scene.problem import Problem
 
 _ERRORS = 2.0
 """Number of standard errors by which a change must be above 0."""
-_EXPLAINED, _TO_EXPLAIN = 0.2, 0.02
-"""Share of the square difference from the references that a map must have explained, and smallest difference relative to the picture, with
-its initial values, of which it must."""
+_EXPLAINED, _OF_MESH, _TO_EXPLAIN = 0.2, 0.9, 0.02
+"""Share of the square difference from the references that a map must have explained; that of a mesh, whose vertices may end anywhere while
+its silhouette fits; and smallest difference relative to the picture, with the initial values, of which they must."""
 _BLOCKS, _CHANCE, _APART = (1, 8, 1 << 30), 7.0, 3
 """Number of blocks of equal sign along each axis, for each tested change of a map; number of standard errors that chance does not reach,
 also where the film's filter makes noise of adjacent pixels alike; distance of compared pixels, at which no filter does."""
@@ -29,13 +29,15 @@ def no_better_maps(
     ends: Sequence[Sequence[np.ndarray]],
     pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
 ) -> list[str]:
-    """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
+    """Return a line for each texture, grid or mesh with whose initial values the pictures are nearly as close to the references.
 
     It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where the pictures with the
-    initial values agree with the references, there is nothing to explain. No map explains noise of the references, see `_may_explain`.
+    initial values agree with the references, there is nothing to explain. No map explains noise of the references, see `_may_explain`. Few
+    random changes of a mesh change the pictures as its residual does, so that of a mesh must not be noise by `misfit`, or the line says
+    that noise hides its cause.
 
     Args:
-        keys: keys of textures and grids.
+        keys: keys of textures, grids and vertices.
         ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
         pictures: function of values and a view that returns such pictures with the same random numbers.
     """
@@ -49,15 +51,25 @@ def no_better_maps(
         first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
         left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * float(np.square(of[0][1]).mean(axis=1) @ of[0][2])
         start, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
-        explained = left - float(last.sum()) > max(fall, _EXPLAINED * left)
-        if (
-            left > max(start, least)
-            and not explained
-            and _may_explain(problem, result.parameters, key, of[1], pictures)
-        ):
+        share, is_mesh = 1.0 - float(last.sum()) / max(left, 1e-300), key in problem.faces
+        explained = share * left > max(fall, (_OF_MESH if is_mesh else _EXPLAINED) * left)
+        if explained or not left > max(start, least):
+            continue
+        remains = math.sqrt(max(1.0 - share, 0.0))
+        if is_mesh:
+            may = misfit(of[1][0][0::2], of[1][0][1::2], *of[1][1:], 0.0, by_pixel=True) is not None
+        else:
+            may = _may_explain(problem, result.parameters, key, of[1], pictures)
+        if may:
+            closer = "hardly" if share < _EXPLAINED else f"{1.0 - remains:.0%}"
             lines.append(
-                f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
-                "it needs more steps, or fewer elements"
+                f"{key}: the final picture is {closer} closer to the references than with its initial values: they hardly determine it, or "
+                f"it needs more steps, or fewer {'vertices' if is_mesh else 'elements'}"
+            )
+        elif is_mesh:
+            lines.append(
+                f"{key}: whether the pictures determine it is not known: the final picture's difference from the references is "
+                f"{remains:.0%} of that with its initial values, and noise hides its cause; use more steps, or more samples per pixel"
             )
     return lines
 

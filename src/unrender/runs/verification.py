@@ -149,7 +149,8 @@ def misfit(
     if difference is None and halves is not None and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
         difference = significant(paired_losses.repeated(parts[0], parts[1], weights), _OF_FEW, True)
     if difference is None and by_pixel:
-        difference = significant(paired_losses.concentrated(one, other, weights, sizes), _OF_CONCENTRATED, True)
+        concentrated = paired_losses.concentrated(one, other, weights, sizes)
+        difference = significant(concentrated, max(least, _OF_CONCENTRATED), True)
     return difference
 
 
