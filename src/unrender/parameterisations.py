@@ -76,7 +76,6 @@ class Log:
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
-        del initial
         return _Log(_lower(bounds))
 
 

@@ -1,7 +1,4 @@
-"""Checks of numbers, flags and text from the user, and a count of values that are not finite.
-
-Each failure is one line with the field's name and the expected value.
-"""
+"""Checks of numbers, flags and text from the user, each failure one line with the field's name and the expected value."""
 
 from __future__ import annotations
 

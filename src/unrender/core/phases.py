@@ -82,7 +82,6 @@ class Stopwatch(Listener):
         self.seconds.setdefault(name, 0.0)
 
     def on_phase_end(self, name: str) -> None:
-        del name
         self._charge()
         self._within.pop()
 

@@ -33,6 +33,5 @@ def _is_command() -> bool:
 
 
 def _end(number: int, frame: object) -> None:
-    del frame
     os.write(2, f"unrender: {_WORDS[signal.Signals(number)]}\n".encode())
     os._exit(128 + number)

@@ -133,7 +133,6 @@ class NotebookBar(phases.Listener):
             self.show(self._within[-1], share)
 
     def on_phase_end(self, name: str) -> None:
-        del name
         self._within.pop()
 
     def show(self, text: str, share: float | None, at_once: bool = False) -> None:

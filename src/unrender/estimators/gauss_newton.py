@@ -85,7 +85,6 @@ class GaussNewtonState:
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """Return an empty state: widths are estimated again."""
-        del upsampler
         return GaussNewtonState({})
 
 

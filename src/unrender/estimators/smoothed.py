@@ -60,7 +60,6 @@ class SmoothedState:
 
     def upsampled(self, upsampler: Upsampler) -> SmoothedState:
         """Return the state without its Hessian, which is estimated again."""
-        del upsampler
         return replace(self, hessian=None)
 
     def restarted(self, fresh: SmoothedState) -> SmoothedState:

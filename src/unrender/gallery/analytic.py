@@ -92,7 +92,6 @@ class _OnePixel:
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        del space, derivatives
         for key in keys:
             if key != self.key:
                 raise InputError(f"parameter {key}: the scene has none of that name; it has {self.key}")
@@ -149,7 +148,6 @@ class ExponentialRenderer(_OnePixel):
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """Render two states with the same random numbers, in either space."""
-        del space
         rendering = self.image(current, request)
         return Rendering(rendering.images, self._images(previous, rendering.paths), rendering.paths)
 
@@ -207,19 +205,15 @@ class QuadraticRenderer(_OnePixel):
         return Rendering(self._images(parameters, request), None, request)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        del request
         return (np.asarray(parameters[POINT]) @ self._jacobian.T)[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        del space
         return Rendering(self._images(current, request), self._images(previous, request), request)
 
     def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
-        del parameters, paths
         return {POINT: weights.reshape(len(weights), -1, 3).sum(axis=1).mean(axis=0) @ self._jacobian}
 
     def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
-        del parameters
         moments = self._images(tangents, paths) ** 2
         return moments if paths.groups > 1 else moments[0]
 

@@ -135,11 +135,9 @@ class WithoutSnapshot:
     needs_whole_views = needs_whole_views
 
     def prepare(self, problem: Problem, state: Any) -> Any:
-        del problem
         return state
 
     def learn(self, problem: Problem, state: Any, sample: PixelSample, contribution: Any) -> Any:
-        del problem, sample, contribution
         return state
 
 
@@ -215,7 +213,6 @@ class Plain(WithoutSnapshot):
     space, pixelwise = None, True
 
     def init(self, problem: Problem, parameters: Tree) -> PlainState:
-        del problem, parameters
         return PlainState()
 
     def estimate(
@@ -229,7 +226,6 @@ class Plain(WithoutSnapshot):
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, None]:
-        del state
         request = frame.request(spp, key.uint32(), groups)
         if pair_request is None:
             rendering = problem.renderer.prepare(list(parameters), None).image(parameters, request)
@@ -243,9 +239,7 @@ class Plain(WithoutSnapshot):
 
     def needs_full_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Return False."""
-        del parameters, state, batches
         return False
 
     def advance(self, parameters: Tree, state: PlainState, contributions: tuple[Any, ...]) -> PlainState:
-        del parameters, contributions
         return state

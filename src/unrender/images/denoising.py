@@ -132,7 +132,6 @@ def _optix_denoiser(width: int, height: int) -> Any:
 
 def _variation(picture: np.ndarray, fast: bool) -> np.ndarray:
     """Apply the model of Rudin, Osher and Fatemi, weighted by the noise that the differences between neighbours show."""
-    del fast
     from skimage.restoration import denoise_tv_chambolle
 
     steps = np.concatenate([np.abs(np.diff(picture, axis=axis)).reshape(-1) for axis in (0, 1)])
@@ -228,7 +227,6 @@ class Denoised(WithoutSnapshot):
 
     def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Return True."""
-        del parameters, state, batches
         return True
 
     def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:

@@ -169,7 +169,6 @@ class RecursiveControlVariate:
             raise InputError(f"RecursiveControlVariate: max_weight must be in (0, 1], got {self.max_weight!r}")
 
     def init(self, problem: Problem, parameters: Tree) -> RecursiveControlVariateState:
-        del problem, parameters
         return RecursiveControlVariateState()
 
     needs_whole_views = needs_whole_views
@@ -179,7 +178,6 @@ class RecursiveControlVariate:
         return batches >= self.whole_views or self._is_first(parameters, state)
 
     def prepare(self, problem: Problem, state: RecursiveControlVariateState) -> RecursiveControlVariateState:
-        del problem
         parts = [(memory.image, self._weight(memory), memory.relative_variance) for memory in state.views]
         return replace(
             state, snapshot=Snapshot(*(arrays.concatenate([arrays.rows(part[n]) for part in parts]) for n in range(3)))

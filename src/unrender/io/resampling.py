@@ -1,7 +1,4 @@
-"""Resampling of textures and grids by Mitsuba's convention, and smaller copies for display.
-
-By the convention, values are at texel centres, and vary linearly between them.
-"""
+"""Resampling of textures and grids by Mitsuba's convention, values at texel centres and linear between them; smaller copies."""
 
 from __future__ import annotations
 

@@ -169,7 +169,6 @@ def _age(path: Path | None) -> int:
 
 @functools.lru_cache(maxsize=4)
 def _load(path: Path | None, age: int, layers: tuple[str, ...], dtype: str) -> _Network:
-    del age
     _torch()
     source = "of torchvision" if path is None else str(path)
     try:

@@ -27,7 +27,6 @@ class _Render(dr.CustomOp):
     """Operation from parameters, tensors attached to the graph, to images that are already rendered."""
 
     def eval(self, backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> Any:
-        del values
         self._backward = backward
         self._shapes = [tuple(image.shape) for image in images]
         several: Any = images

@@ -37,7 +37,6 @@ class _Guided(ABC):
     def _sampler_for(self, problem: Problem) -> GuidedSampler: ...
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
-        del parameters
         return self._sampler_for(problem).init(problem)
 
     def draw(
@@ -170,7 +169,6 @@ class LossProportional(_Guided, PixelSampler):
         uniform_share.check("LossProportional", self.uniform)
 
     def _sampler_for(self, problem: Problem) -> GuidedSampler:
-        del problem
         own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
         return GuidedSampler("LossProportional", _LossDerivative(), *own)
 
@@ -183,5 +181,4 @@ class _LossDerivative(ImportanceRule):
         return (statistics.magnitudes[0],)
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
-        del tiles, maps
         return denoised[0].sum(axis=1)

@@ -100,7 +100,6 @@ class AdaptiveCounts:
 
     def init(self, problem: Problem, parameters: Tree) -> AdaptiveCountsState:
         """Return the state before the first step. Raises `InputError` for a loss that is not pixelwise."""
-        del parameters
         if not problem.loss.pixelwise:
             raise InputError(
                 f"AdaptiveCounts: {type(problem.loss).__name__} is a loss of full images, in which each pixel needs as many samples; "
@@ -137,7 +136,6 @@ class AdaptiveCounts:
     def learn(
         self, problem: Problem, state: AdaptiveCountsState, sample: PixelSample | None, draws: DrawStatistics
     ) -> AdaptiveCountsState:
-        del sample
         tiles, decay, evidence = _tiles(problem), _MEMORY**state.since, state.evidence
         tile = _tile_of_each_pixel(problem, tiles)
         factors = finite(draws.moments), finite(draws.squares)

@@ -74,7 +74,6 @@ class PixelSampler(Protocol):
 
         The same by default.
         """
-        del problem, gradient
         return state
 
 

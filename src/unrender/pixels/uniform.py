@@ -40,17 +40,14 @@ class Uniform(checks.Checked, PixelSampler):
     stratified: bool = True
 
     def init(self, problem: Problem, parameters: Tree) -> UniformState:
-        del parameters
         check_batch("Uniform", problem, self.count)
         tiles = cut(problem, 2 * self.count)
         return UniformState(InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array))
 
     def draw(self, problem: Problem, parameters: Tree, state: UniformState, key: Key) -> tuple[MiniBatch, UniformState]:
-        del parameters
         return self.redraw(problem, state, key), state
 
     def redraw(self, problem: Problem, state: UniformState, key: Key) -> MiniBatch:
-        del problem
         return MiniBatch(state.table.draw(self.count, key, self.stratified))
 
 
@@ -70,15 +67,12 @@ class Views(checks.Checked, PixelSampler):
 
     def init(self, problem: Problem, parameters: Tree) -> None:
         """Return None, as there is no state. Raises `InputError` for a loss that is not pixelwise."""
-        del parameters
         check_batch("Views", problem, 1)
 
     def draw(self, problem: Problem, parameters: Tree, state: None, key: Key) -> tuple[MiniBatch, None]:
-        del parameters, state
         return self.redraw(problem, None, key), None
 
     def redraw(self, problem: Problem, state: None, key: Key) -> MiniBatch:
-        del state
         total = len(problem.views)
         count, random = min(self.count, total), np.random.default_rng(key.uint32())
         chosen = np.sort(random.choice(total, count, replace=False))
@@ -106,13 +100,10 @@ class All(PixelSampler):
     """All pixels of all views at every step."""
 
     def init(self, problem: Problem, parameters: Tree) -> AllState:
-        del problem, parameters
         return AllState()
 
     def draw(self, problem: Problem, parameters: Tree, state: AllState, key: Key) -> tuple[MiniBatch, AllState]:
-        del problem, parameters, key
         return MiniBatch(None), state
 
     def redraw(self, problem: Problem, state: AllState, key: Key) -> MiniBatch:
-        del problem, state, key
         return MiniBatch(None)

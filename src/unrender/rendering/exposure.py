@@ -65,7 +65,6 @@ class ExposedRenderer(PictureFactors):
 
     def factors(self, values: Array, places: Array, like: Array) -> Array:
         """Return the factors as (1, 3), or as (N, 3) if each pixel has its own sensor."""
-        del like
         return arrays.exp(self._centred_rows(values, places) * _LN2)
 
     def factors_of_batch(self, values: np.ndarray, sensor: int) -> np.ndarray:
@@ -79,7 +78,6 @@ class ExposedRenderer(PictureFactors):
 
     def gradient(self, values: Array, places: Array, weighted: Array) -> Array:
         """Return the gradient by the exposures, (V, 3), without its mean over rows, since the factors use centred exposures."""
-        del values
         count = len(self.rows)
         parts = arrays.mean_over_first(weighted)
         parts = parts if len(arrays.shape(parts)) == 2 else arrays.sum_over_rows(parts)
@@ -178,7 +176,6 @@ class VignettedRenderer(PictureFactors):
 
     def gradient(self, values: Array, places: Array, weighted: Array) -> Array:
         """Return ln 2 times the sum over pixels and channels of `weighted` times the power of r, (3,)."""
-        del values
         parts = arrays.mean_over_first(weighted)
         of_pixels = arrays.sum_over_last(arrays.reshape(parts, (arrays.shape(places)[0], 3)))
         return arrays.reshape(arrays.sum_over_rows(places * of_pixels), (_TERMS,)) * _LN2

@@ -211,7 +211,6 @@ class FactorSession(PictureSession[PictureFactors]):
         return images * self._factors(parameters, places, images)
 
     def _slopes(self, parameters: Tree, places: Array, images: Array, weights: Array) -> Array:
-        del images
         return self._factors(parameters, places, weights)
 
     def _pull_back(self, parameters: Tree, places: Array, images: Array, weights: Array) -> tuple[Array, Array]:

@@ -117,16 +117,13 @@ class RespondingSession(PictureSession[RespondingRenderer]):
         return moment
 
     def _outer_images(self, parameters: Tree, places: None, images: Array) -> Array:
-        del places
         return _curve_at(parameters, images).values
 
     def _slopes(self, parameters: Tree, places: None, images: Array, weights: Array) -> Array:
-        del places, weights
         return _curve_at(parameters, images).slopes
 
     def _pull_back(self, parameters: Tree, places: None, images: Array, weights: Array) -> tuple[Array, Array]:
         """Return the weights of the inner images, and the gradient by the response (3, 2): the sum over pixels, the mean over groups."""
-        del places
         at = _curve_at(parameters, images)
         columns = []
         for by in (at.by_contrast, at.by_brightness):

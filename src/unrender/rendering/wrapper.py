@@ -100,17 +100,14 @@ class SessionWrapper:
 
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         """Return the inner session's tangents for outer ones."""
-        del parameters
         return self._state(tangents)
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
         """Return the gradient by the outer parameters for that by the inner ones."""
-        del parameters, paths
         return inner_gradient
 
     def _shown(self, rendering: Rendering, request: SampleRequest) -> Rendering:
         """Return the outer rendering for an inner one."""
-        del request
         return rendering
 
     def _paths(self, paths: Any) -> Any:

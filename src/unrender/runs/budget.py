@@ -45,7 +45,6 @@ class Budget(Callback):
         self._kernels = cache.kernels_changed()
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        del fresh, warm
         run.compiled = cache.kernels_changed() != self._kernels
 
     def on_start(self, run: Run) -> None:
@@ -59,7 +58,6 @@ class Budget(Callback):
         self._check(run)
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        del estimate, applied
         self._check(run)
 
     def _check(self, run: Run) -> None:

@@ -79,7 +79,6 @@ class NotebookProgress(Callback):
         self._bar.show(", ".join(parts), run.progress())
 
     def on_end(self, run: Run, result: Result) -> None:
-        del run
         self._summary = f"{result.steps} steps in {formatting.duration(result.seconds)}"
         compiling = result.phases.get(COMPILING, 0.0)
         self._summary += f", without {formatting.duration(compiling)} of compiling" if compiling >= 0.5 else ""

@@ -124,7 +124,6 @@ class Progress(Callback):
             self._print(self._line(run, record))
 
     def on_end(self, run: Run, result: Result) -> None:
-        del run, result
         self._close()
 
     # ------------------------------------------------------------------ the parts

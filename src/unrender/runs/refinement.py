@@ -144,7 +144,7 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
 
 
 class MeshRefinement(Callback):
-    """Callback that remeshes before the steps in `Parameter.remeshing`. A mesh that cannot be remeshed stays, with a warning."""
+    """Callback that remeshes before the steps in `Parameter.remeshing`, or warns and keeps the mesh. Compiling counts as warm-up."""
 
     def __init__(self) -> None:
         self._made: dict[str, int] = {}

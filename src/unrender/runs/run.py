@@ -264,7 +264,6 @@ def interruptible(run: Run) -> Iterator[None]:
             signal.signal(number, handler)
 
     def stop(number: int, frame: Any) -> None:
-        del frame
         run.stop(reasons[signal.Signals(number)])
         restore_handlers()
 

@@ -81,7 +81,6 @@ class Unchanged:
 
     def upsampled(self, upsampler: Upsampler) -> Any:
         """Return this state."""
-        del upsampler
         return self
 
 

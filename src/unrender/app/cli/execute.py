@@ -58,7 +58,7 @@ def execution(
     console: Console,
     progress: Progress,
 ) -> Iterator[dict[str, Any]]:
-    """Print the plan and yield the arguments of `optimize`. Remove the files of the live page if the block succeeds."""
+    """Print the plan and yield the arguments of `optimize`, which writes a run folder. Remove live files if the block succeeds."""
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
         console.say(f"{order.method.name}: {line}")

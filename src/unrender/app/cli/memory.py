@@ -135,12 +135,10 @@ def _passing_on(child: int) -> Iterator[None]:
     """Forward signals to the child, and stop and continue together with it."""
 
     def pass_on(number: int, frame: FrameType | None) -> None:
-        del frame
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, number)
 
     def stop(number: int, frame: FrameType | None) -> None:
-        del number
         pass_on(signal.SIGSTOP, frame)
         os.kill(os.getpid(), signal.SIGSTOP)
         pass_on(signal.SIGCONT, frame)

@@ -127,7 +127,6 @@ class DistributedExecutor:
         return replace(gathered, draws=joined([(part, draws) for part, draws in draws_of_parts if draws is not None]))
 
     def trace_pilot(self, problem: Problem, request: PilotRequest) -> list[np.ndarray]:
-        del problem
         self._reset_traffic()
         known, tangents = self._outbox.numbered(request.parameters), self._outbox.once(request.tangents)
         sent = {one.number: one for tree in (known, tangents) for one in tree.values()}
@@ -154,7 +153,6 @@ class DistributedExecutor:
         self._in_step = True
 
     def prepare_images(self, problem: Problem, image: Any, state: Any) -> Any:
-        del problem, image
         if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
             return replace(state, snapshot=state.views)
         return state

@@ -1,7 +1,4 @@
-"""State of the workers as the main process tracks it: memories of views, and the parameters that were sent.
-
-Memories have numbers, with the steps that restore them. Each parameter array is sent once.
-"""
+"""State of the workers as the main process tracks it: numbered memories, with the steps that restore them, and parameters sent once."""
 
 from __future__ import annotations
 

@@ -38,7 +38,6 @@ class GradientMean(checks.Checked, StepTransform):
     decay: Fraction = 0.9
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanDirection:
-        del learning_rates
         return MeanDirection(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: MeanDirection) -> tuple[StepUpdate, MeanDirection]:
@@ -72,7 +71,6 @@ class DecayingSum(checks.Checked, StepTransform):
     momentum: Fraction = 0.9
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Velocity:
-        del learning_rates
         return Velocity(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: Velocity) -> tuple[StepUpdate, Velocity]:
@@ -122,7 +120,6 @@ class ScheduleFreeAverage(checks.Checked, StepTransform):
         return True
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Iterates:
-        del learning_rates
         return Iterates(dict(parameters), dict(parameters))
 
     def update(self, update: StepUpdate, state: Iterates) -> tuple[StepUpdate, Iterates]:

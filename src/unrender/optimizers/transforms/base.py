@@ -134,7 +134,6 @@ class StepTransform(ABC):
 
     def choices(self, state: Any, made: int) -> tuple[str, ...]:
         """Return the choices of the transform after `made` steps for display, one line each."""
-        del state, made
         return ()
 
 

@@ -306,7 +306,6 @@ class FittedSobolev(StepTransform):
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> FittedSobolevState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
-        del learning_rates
         for key in self.preconditioned:
             if key not in parameters:
                 raise InputError(f'FittedSobolev: preconditioned: unknown parameter "{key}"')
@@ -345,7 +344,6 @@ class FittedSobolev(StepTransform):
 
     def choices(self, state: FittedSobolevState, made: int) -> tuple[str, ...]:
         """Return the fitted strengths relative to the given ones."""
-        del made
         fitted = [f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count]
         return (f"smoothing, as a share of the strongest: {listed(fitted)}",) if fitted else ()
 
@@ -379,7 +377,6 @@ class ApplyPreconditioner(StepTransform):
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        del state
         direction = dict(update.direction)
         for key, change in update.smoothing.items():
             if key in direction:

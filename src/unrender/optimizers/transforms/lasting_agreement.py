@@ -99,7 +99,6 @@ class LastingAgreement(checks.Checked, StepTransform):
     shortest: Count = 48
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientBlocks:
-        del learning_rates
         total, last, earlier = (trees.zeros_like(parameters) for _ in range(3))
         zeros, ones = {key: arrays.total(x) for key, x in total.items()}, dict.fromkeys(parameters, 1.0)
         growths = dict.fromkeys(parameters, 0.0)
@@ -128,7 +127,6 @@ class LastingAgreement(checks.Checked, StepTransform):
 
     def choices(self, state: GradientBlocks, made: int) -> tuple[str, ...]:
         """Return the fractions that are below 1."""
-        del made
         low = [f"{key} {max(fraction, _LEAST):.2g}" for key, fraction in state.fractions.items() if fraction < 1.0]
         return (f"agreement of gradients that lasts: {listed(low)}",) if low else ()
 

@@ -59,7 +59,6 @@ class ScaleByRms(StepTransform):
             object.__setattr__(self, "uniform", checked_keys("ScaleByRms: uniform", self.uniform))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanSquare:
-        del learning_rates
         return MeanSquare(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: MeanSquare) -> tuple[StepUpdate, MeanSquare]:
@@ -115,7 +114,6 @@ class ScaleByDeviation(checks.Checked, StepTransform):
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        del state
         variance = update.estimate.require("ScaleByDeviation", Variance).values
         direction = {key: x / arrays.sqrt(variance[key] + self.epsilon) for key, x in update.direction.items()}
         return replace(update, direction=direction), None
@@ -136,7 +134,6 @@ class ClipDirection(checks.Checked, StepTransform):
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        del state
         most = self.longest * update.divisor
 
         def clipped(x: arrays.Array) -> arrays.Array:

@@ -67,7 +67,6 @@ class WienerShrinkage(StepTransform):
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientProducts:
         """Return the state before the first step. Raises `InputError` for an unknown key."""
-        del learning_rates
         if unknown := next((key for key in self.keys if key not in parameters), None):
             raise InputError(f'WienerShrinkage: keys: unknown parameter "{unknown}"')
         zeros = {key: arrays.zeros_like(parameters[key]) for key in self.keys}
@@ -192,7 +191,6 @@ class PullToStart(StepTransform):
             checks.number("PullToStart", f"weight of {key}", weight, above=0.0)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Start:
-        del learning_rates
         return Start({key: parameters[key] for key in self.weights})
 
     def update(self, update: StepUpdate, state: Start) -> tuple[StepUpdate, Start]:

@@ -264,7 +264,6 @@ class _PrintableLog(mi.Appender):
     """Appender that writes Mitsuba's messages to standard error."""
 
     def append(self, level: Any, text: str) -> None:
-        del level
         print(one_line(" ".join(text.split())), file=sys.stderr)
 
     def log_progress(self, progress: float, name: str, formatted: str, eta: str, ptr: Any = None) -> None:

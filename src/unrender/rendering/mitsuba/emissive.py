@@ -95,7 +95,6 @@ def _plugin(variant: str) -> type:
                 callback.put(f"{COEFFICIENT}{number}", volume, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any) -> None:
-            del keys
             self.majorant = dr.opaque(mi.Float, dr.detach(self.sigma_t.max()))
 
         def to_string(self) -> str:

@@ -57,7 +57,6 @@ class _Registry:
         number = next(self._serial)
 
         def died(reference: weakref.ref[LoadedScene]) -> None:
-            del reference
             self._scenes.pop(number, None)
             self.any_died = True
 

@@ -171,10 +171,8 @@ class MovedPairPass(Pass):
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
         """Return the function to record. Each state has the rays of its own sensors, and `tracer` replaces the kernel."""
-        del kernel, posed
 
         def launch(scenes, loaded, tables, seeds, pixels, films, rays):
-            del loaded
             seed, positions = seeds
             with dr.suspend_grad():
                 generated: list[tuple[Any, Any]] = []
@@ -294,10 +292,8 @@ class PosesPass(Pass):
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
         """Return the function to record. The pass's own array is the raveled `PosedScene.numbers()`. It uses its own `posed`."""
-        del posed
 
         def launch(scenes, loaded, tables, seeds, pixels, films, rays, numbers):
-            del loaded
             seed, positions = seeds
             lanes = size.pixels * size.spp
             batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes

@@ -39,12 +39,10 @@ class RepeatingSampler:
 
     def next_1d(self, active: Any = True) -> Any:
         """Return a uniform number per lane, including inactive lanes."""
-        del active
         return self.rng.next_float32()
 
     def next_2d(self, active: Any = True) -> Any:
         """Return two uniform numbers per lane, including inactive lanes."""
-        del active
         first = self.rng.next_float32()
         return mi.Point2f(first, self.rng.next_float32())
 
@@ -83,7 +81,6 @@ class StratifiedSampler:
 
     def next_2d(self, active: Any = True) -> Any:
         """Return two uniform numbers per lane, including inactive lanes."""
-        del active
         x, y = mi.sample_tea_32(self.group, self.pair, 8)  # with the default of 4 rounds, consecutive pairs are related
         order = mi.sample_tea_32(self.group, self.pair + (1 << 31), 8)
         self.pair = self.pair + 1

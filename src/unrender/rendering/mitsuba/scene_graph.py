@@ -309,7 +309,6 @@ def _callback(variant: str | None) -> Any:
             self.objects: list[tuple[str, Any]] = []
 
         def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
-            del cpptype
             if isinstance(value, mi.Object):
                 self.put_object(name, value, flags)
 
@@ -317,7 +316,6 @@ def _callback(variant: str | None) -> Any:
             del name, ptr, flags, cpptype
 
         def put_object(self, name: str, obj: Any, flags: Any) -> None:
-            del flags
             if obj is not None:
                 self.objects.append((name, obj))
 

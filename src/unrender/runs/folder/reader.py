@@ -1,7 +1,4 @@
-"""Reader of run folders, with one-line errors.
-
-Resume, report, compare, watch and export read run folders through this module and `history`. Nothing in a folder is trusted.
-"""
+"""Reader of run folders for resume, report, compare, watch and export, with one-line errors. Nothing in a folder is trusted."""
 
 from __future__ import annotations
 

@@ -157,7 +157,6 @@ class RunWriter(Callback):
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
-        del fresh, warm
         if self.final_spp != 1 and not run.stopped:
             share = _TESTED_SHARE[run.compiled]
             self._tested = run.seconds is None or run.time_left() > share * run.seconds

@@ -27,7 +27,6 @@ class AovKernel:
         self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, None]:
         """Trace one ray per lane, see `PathKernel.sample`. Raise `ValueError` for pairs."""
-        del sampler
         if context.pair:
             raise ValueError("aov: expected one state")
         with context.resume_grad():
@@ -54,6 +53,5 @@ class AovKernel:
 
     def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         """Return the number of vertices per lane, see `PathKernel.vertices`: 1 where the ray hits a surface, else 0."""
-        del sampler
         geometry: Any = context.geometry
         return dr.select(geometry.ray_test(mi.Ray3f(ray), mi.Bool(True)), mi.Float(1), 0)

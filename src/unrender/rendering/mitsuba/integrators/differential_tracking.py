@@ -1,7 +1,4 @@
-"""Derivatives by a participating medium along a ray: points where in-scattering begins, and the medium's own collisions.
-
-Symbols are those of `tracking`.
-"""
+"""Derivatives by a medium along a ray: points where in-scattering begins, and its own collisions. Symbols as in `tracking`."""
 
 from __future__ import annotations
 

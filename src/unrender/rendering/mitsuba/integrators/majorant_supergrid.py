@@ -246,7 +246,6 @@ class HomogeneousMajorant:
 
     def advance(self, dda: DdaState, τ: Any, active: Any) -> DdaState:
         """Advance by an optical depth `τ` of the majorant, beyond `far` if the remaining optical depth is smaller."""
-        del active
         dda.t = dda.t + dr.select(dda.σ̄ > 0, τ / dda.σ̄, dr.inf)
         return dda
 
