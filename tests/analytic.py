@@ -25,18 +25,28 @@ from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest,
 
 @dataclass(frozen=True)
 class AnalyticPaths:
-    """Random numbers of a rendering, (pixels, channels, spp, 2), with the number of groups and the chosen pixels."""
+    """Seed and shape of the random numbers of a rendering, with the number of groups and the chosen pixels."""
 
-    numbers: np.ndarray
+    seed: int
+    shape: tuple[int, int, int, int]
     groups: int
     pixels: np.ndarray | None
+    positions: np.ndarray | None
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """(pixels, channels, spp, 2), drawn when they are first needed."""
+        numbers = np.random.default_rng(self.seed).random(self.shape)
+        return numbers if self.positions is None else numbers[self.positions]
 
     @cached_property
     def centred(self) -> np.ndarray:
         """Mean of 2 u - 1 over each group's samples, for both random numbers: (2, groups, pixels * channels)."""
-        pixels, channels, spp, _ = self.numbers.shape
-        parts = (2 * self.numbers - 1).reshape(pixels * channels, self.groups, spp // self.groups, 2)
-        return parts.mean(axis=2).T
+        pairs = self.numbers.view(
+            np.complex128
+        )  # NumPy adds up pairs of numbers in a tenth of the time as complex ones
+        means = pairs.reshape(-1, self.groups, self.shape[2] // self.groups).mean(axis=2)
+        return 2 * means.view(np.float64).reshape(*means.shape, 2).T - 1
 
 
 class AnalyticRenderer:
@@ -123,7 +133,7 @@ class AnalyticRenderer:
 
     def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
         rows = self._rows(paths.pixels)
-        factors = 1 + self.noise * paths.centred[0]
+        factors = 1 + self.noise * paths.centred[0] if self.noise else 1.0
         flat = (np.asarray(weights).reshape(paths.groups, -1) * factors).mean(axis=0) @ self.matrix[rows]
         gradient, start = {}, 0
         for key, value in self._values.items():
@@ -159,15 +169,13 @@ class AnalyticRenderer:
     def _paths(self, request: SampleRequest) -> AnalyticPaths:
         count = self.shape[0] * self.shape[1] if request.pixels is None else len(request.pixels)
         total = count if request.positions is None else int(np.max(request.positions)) + 1
-        numbers = np.random.default_rng(request.seed).random((total, 3, request.spp, 2))
-        if request.positions is not None:
-            numbers = numbers[request.positions]
-        return AnalyticPaths(numbers, request.groups, request.pixels)
+        shape = (total, 3, request.spp, 2)
+        return AnalyticPaths(request.seed, shape, request.groups, request.pixels, request.positions)
 
     def _images(self, parameters: Tree, paths: AnalyticPaths) -> np.ndarray:
         rows = self._rows(paths.pixels)
         linear = (self.matrix @ self._flat(parameters))[rows]
         shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
-        multiplied, added = paths.centred
+        multiplied, added = paths.centred if self.noise or self.grain else np.zeros((2, paths.groups, 1))
         images = self.offset[rows] + linear * (1 + self.noise * multiplied) + self.grain * added
         return images.reshape(paths.groups, *shape)

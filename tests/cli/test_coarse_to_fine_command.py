@@ -7,10 +7,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import pytest
 
 KEY = "wall.bsdf.reflectance.data"
 
 
+@pytest.mark.slow
 def test_runs_are_resumed_across_a_change_and_shown(unrender, problem: Path, mitsuba_variant: str):
     folder = problem.parent
     texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="wall.exr"/></texture>'

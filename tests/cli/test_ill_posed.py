@@ -79,6 +79,7 @@ def test_a_pair_that_only_its_product_or_sum_determines(
         assert "\n" not in own
 
 
+@pytest.mark.slow
 def test_a_number_that_no_picture_shows(unrender, tmp_path: Path, mitsuba_variant: str) -> None:
     lines = played(unrender, written(tmp_path, 12, WALL, HIDDEN), mitsuba_variant)
     assert len([line for line in lines if line.startswith(f"{HIDDEN}: ")]) == 1

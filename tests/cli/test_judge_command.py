@@ -17,15 +17,13 @@ MASK = np.array([[1, 1, 1, 0, 0, 0]] * 4, np.float32)
 
 
 @pytest.fixture
-def run(unrender, problem: Path, mitsuba_variant: str) -> Path:
+def run(run_once, problem: Path, mitsuba_variant: str) -> Path:
     """A run of two steps whose result is set to `FOUND`, and held-out.toml beside its problem: the left half counts."""
-    words = ["--steps", 2, "--out", "result", "--variant", mitsuba_variant, "--method", "plain", "--final-spp", 4]
-    answer = unrender("run", "problem.toml", *words)
-    assert answer.status == 0, answer.error
-    np.savez(problem.parent / "result" / "parameters.npz", **{KEY: FOUND})  # pyright: ignore[reportArgumentType]
+    folder = run_once("--steps", 2, "--variant", mitsuba_variant, "--method", "plain", "--final-spp", 4)
+    np.savez(folder / "parameters.npz", **{KEY: FOUND})  # pyright: ignore[reportArgumentType]
     mi.Bitmap(MASK[..., None]).write(str(problem.parent / "mask.exr"))
     (problem.parent / "held-out.toml").write_text(problem.read_text() + 'mask = "mask.exr"\n')
-    return problem.parent / "result"
+    return folder
 
 
 def srgb(x: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tiers import quick
 from unrender.app.cli import memory, signals
 from unrender.backend import limits
 from unrender.core.errors import InputError
@@ -132,7 +133,7 @@ def test_a_container_ends_the_process(tmp_path: Path, name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("words", [["run", "nowhere.toml"], ["methods", "rcv"]])
+@pytest.mark.parametrize("words", [["run", "nowhere.toml"], ["run", "--help"]])
 def test_in_a_container_all_is_as_elsewhere(tmp_path: Path, words: list[str]) -> None:
     inside, outside = (start(tmp_path, words, None, before) for before in (CONTAINER, ""))
     assert [*inside.communicate(timeout=60), inside.returncode] == [
@@ -141,7 +142,7 @@ def test_in_a_container_all_is_as_elsewhere(tmp_path: Path, words: list[str]) ->
     ]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_signals_reach_a_run_in_a_container_once(tmp_path: Path, number: signal.Signals) -> None:
     process = start(tmp_path, [*TOY, "--steps", "1000000"], None, CONTAINER)
     history = tmp_path / "run" / "history.jsonl"

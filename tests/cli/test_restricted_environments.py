@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tiers import quick
+
 NAMELESS = """
 import pwd, sys
 
@@ -17,19 +19,21 @@ def unknown(uid):
 
 pwd.getpwuid = unknown
 from unrender.app.cli.main import main
-sys.exit(main())
+for line in sys.argv[1:]:
+    if status := main(line.split()):
+        sys.exit(f"{line}: status {status}")
 """
-"""The command of a user whose number has no name, as of `docker run --user 4321`."""
+"""Commands, one line each, of a user whose number has no name, as of `docker run --user 4321`."""
 
 
-def run(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(folder: Path, *lines: str, **environment: str) -> subprocess.CompletedProcess[str]:
     kept = {
         name: value
         for name, value in os.environ.items()
         if not name.startswith(("HOME", "XDG", "UNRENDER", "DRJIT_CACHE"))
     }
     return subprocess.run(
-        [sys.executable, "-c", NAMELESS, *words],
+        [sys.executable, "-c", NAMELESS, *lines],
         cwd=folder,
         env=kept | {"COLUMNS": "100"} | environment,
         capture_output=True,
@@ -38,9 +42,8 @@ def run(folder: Path, *words: str, **environment: str) -> subprocess.CompletedPr
     )
 
 
-@pytest.mark.parametrize("words", [["--version"], ["methods", "rcv"], ["gallery"]])
-def test_no_home_and_no_name(tmp_path: Path, words: list[str]) -> None:
-    done = run(tmp_path, *words)
+def test_no_home_and_no_name(tmp_path: Path) -> None:
+    done = run(tmp_path, "--version", "methods rcv", "gallery")
     told = [
         line
         for line in done.stderr.splitlines()
@@ -49,11 +52,11 @@ def test_no_home_and_no_name(tmp_path: Path, words: list[str]) -> None:
     assert (done.returncode, told) == (0, [])
 
 
-@pytest.mark.parametrize("home", ["missing", "file"])
+@pytest.mark.parametrize("home", quick(["missing", "file"], "missing"))
 def test_a_home_that_cannot_be_written(tmp_path: Path, home: str) -> None:
     (tmp_path / "file").touch()
-    words = ["run", "exponential", "--method", "plain", "--steps", "2", "--out", str(tmp_path / "run")]
-    done = run(tmp_path, *words, HOME=str(tmp_path / "file" / home))
+    line = "run exponential --method plain --steps 2 --final-spp 1 --out run"
+    done = run(tmp_path, line, HOME=str(tmp_path / "file" / home))
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr + done.stdout
     assert (tmp_path / "run" / "run.json").exists()

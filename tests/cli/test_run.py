@@ -114,19 +114,11 @@ def test_run_takes_emitters_by_the_gradient_s_variance(unrender, problem: Path, 
     assert "option emitters: expected scene or adaptive, got 'power'" in wrong.error
 
 
-def test_run_names_a_new_folder_each_time(unrender, problem: Path, mitsuba_variant: str):
+def test_run_names_a_new_folder_each_time(unrender, tmp_path: Path, mitsuba_variant: str):
     for _ in range(2):
-        words = ["run", "problem.toml", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant, *QUICK]
-        assert unrender(*words).status == 0
-    assert names(problem.parent / "out") == ["problem-plain", "problem-plain-2"]
-
-
-def test_run_says_what_was_done_to_the_input(unrender, problem: Path, mitsuba_variant: str):
-    mi.Bitmap(np.full((4, 6, 3), 188, np.uint8)).write(str(problem.parent / "photo.png"))
-    problem.write_text(problem.read_text().replace("photo.exr", "photo.png"))
-    answer = unrender("run", "problem.toml", "--steps", 1, "--variant", mitsuba_variant, *QUICK)
-    assert answer.status == 0
-    assert "note: view 0: reference photo.png: 8-bit sRGB, linearised" in answer.out
+        words = ["run", "exponential", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant]
+        assert unrender(*words, "--final-spp", 1).status == 0
+    assert names(tmp_path / "out") == ["exponential-plain", "exponential-plain-2"]
 
 
 def test_run_replaces_earlier_results_only_when_told(unrender, problem: Path, mitsuba_variant: str):
@@ -151,14 +143,19 @@ def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_va
     assert not (problem.parent / "result").exists()
 
 
-def test_run_warns_of_a_parameter_without_influence(unrender, problem: Path, mitsuba_variant: str):
+def test_run_says_what_was_done_to_the_input_and_warns_of_a_parameter_without_influence(
+    unrender, problem: Path, mitsuba_variant: str
+):
+    mi.Bitmap(np.full((4, 6, 3), 188, np.uint8)).write(str(problem.parent / "photo.png"))
     hidden = '<shape type="sphere" id="hidden"><transform name="to_world"><translate z="50"/></transform>'
     hidden += '<bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape></scene>'
     scene = problem.parent / "wall.xml"
     scene.write_text(scene.read_text().replace("</scene>", hidden))
-    problem.write_text(problem.read_text() + '[[parameters]]\nkey = "hidden.bsdf.reflectance.value"\n')
+    text = problem.read_text().replace("photo.exr", "photo.png")
+    problem.write_text(text + '[[parameters]]\nkey = "hidden.bsdf.reflectance.value"\n')
     answer = unrender("run", "problem.toml", "--steps", 8, "--variant", mitsuba_variant, *QUICK)
     assert answer.status == 0
+    assert "note: view 0: reference photo.png: 8-bit sRGB, linearised" in answer.out
     assert "warning parameter hidden.bsdf.reflectance.value: its gradient is zero" in answer.out
 
 

@@ -71,9 +71,9 @@ def await_package(process: subprocess.Popen[str]) -> None:
     assert process.stderr.readline() == "loading\n"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_while_the_command_is_loaded(tmp_path: Path, number: signal.Signals) -> None:
-    for n, moment in enumerate((0.0, 0.1, 0.25, 0.4)):
+@pytest.mark.parametrize(("number", "moments"), [(signal.SIGINT, (0.0, 0.25)), (signal.SIGTERM, (0.1, 0.4))])
+def test_while_the_command_is_loaded(tmp_path: Path, number: signal.Signals, moments: tuple[float, ...]) -> None:
+    for n, moment in enumerate(moments):
         process = start(tmp_path / str(n), "methods", "rcv")
         await_package(process)
         time.sleep(moment)

@@ -52,7 +52,7 @@ found["kinds"] = {kind: sorted(c.__module__ for c in registry.components(kind).v
 def make(name, **fields):
     return tables.component({"type": name, **fields})
 
-def error(asked, estimator, optimizer, steps=200):
+def error(asked, estimator, optimizer, steps=100):
     history = ur.optimize(asked, estimator, optimizer, steps).history
     errors = [max(record["parameter_error"].values()) for record in history if "parameter_error" in record]
     return [errors[0], errors[-1]]

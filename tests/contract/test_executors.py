@@ -50,10 +50,15 @@ def run(problem: ur.Problem, folder: Path, steps: int) -> ur.Result:
     return ur.optimize(problem, estimator, ur.optimizers.Adam(0.02), steps, run_directory=folder, progress=False)
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> ur.Result:
+    """The run of one process."""
+    return run(analytic.problem(views=VIEWS), tmp_path_factory.mktemp("alone"), STEPS)
+
+
 @pytest.mark.parametrize("name", EXECUTORS)
-def test_runs_are_alike_and_change_executors_on_the_way(name: str, tmp_path: Path) -> None:
+def test_runs_are_alike_and_change_executors_on_the_way(name: str, alone: ur.Result, tmp_path: Path) -> None:
     problem = analytic.problem(views=VIEWS)
-    alone = run(problem, tmp_path / "alone", STEPS)
     executor = EXECUTORS[name](problem)
     other = problem.with_parts(executor=executor)
     whole = run(other, tmp_path / "whole", STEPS)

@@ -11,7 +11,6 @@ from test_estimators import ESTIMATORS as OF_ANALYTIC_PROBLEMS
 
 import unrender as ur
 from spectral_scenes import COLOUR, DEPTH, SIZE, SPECTRUM, TEXTURE, scene
-from tiers import quick
 from unrender.rendering.mitsuba import film_response
 
 pytestmark = pytest.mark.usefixtures("spectral_variant")
@@ -66,7 +65,8 @@ def worst(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     return float(np.abs(z).max()), float(limit)
 
 
-@pytest.mark.parametrize("name", quick(ESTIMATORS, "control variate, path space"))
+@pytest.mark.slow  # tests/render/test_spectral.py has the adjoint in the quick tier
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_gradient_is_right(name: str, problem: ur.Problem, expected: np.ndarray) -> None:
     estimator = ESTIMATORS[name]()
     if "gradient" not in estimator.provides or name in OTHER_EXPECTATION:

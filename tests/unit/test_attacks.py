@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -65,8 +66,12 @@ ATTACKS = {
 }  # fmt: skip
 
 
+@cache
+def functions(file: str) -> set[str]:
+    return {node.name for node in ast.parse((TESTS / file).read_text()).body if isinstance(node, ast.FunctionDef)}
+
+
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_each_attack_has_its_test(attack: str) -> None:
     file, _, name = ATTACKS[attack].partition("::")
-    tree = ast.parse((TESTS / file).read_text())
-    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    assert name in functions(file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,14 @@ torch: Any = pytest.importorskip("torch")
 
 from benchmarks.rcv.fig10_perceptual import train  # noqa: E402
 from unrender import losses  # noqa: E402
+
+PICTURES = functools.cache(train.pictures)
+"""Decoded once for all tests."""
+
+
+@pytest.fixture(autouse=True)
+def pictures_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "pictures", PICTURES)
 
 
 def test_the_same_weights_at_every_call_that_the_loss_takes(tmp_path: Path) -> None:

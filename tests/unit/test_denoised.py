@@ -112,8 +112,10 @@ def test_the_previous_state_is_denoised_alike() -> None:
     "estimator",
     [
         pytest.param(lambda by: ur.PathGradient(Denoised(by=by), spp=4), id="plain"),
-        pytest.param(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=2), id="control variate"),
-        pytest.param(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=1), id="own paths"),
+        pytest.param(
+            lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=2), id="control variate", marks=pytest.mark.slow
+        ),
+        pytest.param(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=1), id="own paths", marks=pytest.mark.slow),
         pytest.param(lambda by: ur.MetaEstimator(coupled=True, spp=2, image=Denoised(CV(), by=by)), id="coupled"),
     ],
 )

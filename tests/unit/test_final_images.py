@@ -17,6 +17,7 @@ import pytest
 import scipy.ndimage
 
 from tests.analytic import AnalyticRenderer
+from tiers import quick, slow
 from unrender import losses, optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
@@ -295,7 +296,7 @@ def textured(shift: float, noise: float, count: int = 2) -> Problem:
     return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given, truth=truth)
 
 
-@pytest.mark.parametrize(("shift", "told"), [(0.25, True), (0.0, False)])
+@pytest.mark.parametrize(("shift", "told"), [(0.25, True), slow(0.0, False)])
 def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_paths(
     shift: float, told: bool, tmp_path: Path
 ) -> None:
@@ -328,7 +329,7 @@ class OfFullViews(losses.L2):
         return False
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", quick([2, 5], 2))
 @pytest.mark.parametrize(("rate", "rises"), [(0.1, True), (0.003, False)])
 def test_a_run_that_the_final_pictures_find_worse_returns_its_start(
     rate: float, rises: bool, count: int, tmp_path: Path

@@ -53,19 +53,23 @@ def parsed(source: str) -> ast.Module:
 @cache
 def names_imported(source: str) -> list[tuple[str, int, bool]]:
     """(name below `unrender`, line, whether it is imported when the file is: neither in a function nor for type checkers alone)."""
-    tree, found = parsed(source), []
-    lazy = {id(x) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) for x in ast.walk(node)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            lazy |= {id(x) for x in ast.walk(node)}
-    for node in ast.walk(tree):
+    found: list[tuple[str, int, bool]] = []
+
+    def visit(node: ast.AST, now: bool) -> None:
         names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         own = (name.removeprefix("unrender.") for name in names if name.startswith("unrender."))
-        found += [(name, getattr(node, "lineno", 0), id(node) not in lazy) for name in own]
+        found.extend((name, getattr(node, "lineno", 0), now) for name in own)
+        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        now = now and not for_types and not isinstance(node, ast.FunctionDef)
+        for child in ast.iter_child_nodes(node):
+            if not isinstance(child, ast.expr):  # an expression imports nothing
+                visit(child, now)
+
+    visit(parsed(source), True)
     return found
 
 

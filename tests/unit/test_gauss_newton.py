@@ -10,6 +10,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import quick
 from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
@@ -351,6 +352,7 @@ def ratio_of_variances(seeds: int) -> float:
     return float(np.mean(stated))
 
 
+@pytest.mark.slow
 def test_standard_errors_count_noise_that_the_fit_has_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """12 pixels decide three numbers. Their residuals are less than the noise, by 1 − h, which the planted fault takes as the noise."""
     monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
@@ -622,6 +624,7 @@ def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
     assert scatter[3.0] < 0.8 * scatter[None]
 
 
+@pytest.mark.slow
 def test_noisy_channels_do_not_outweigh_the_others_of_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """One channel has ten times the noise of the others: weights of whole pixels cannot tell them apart."""
     states = system.Point._states
@@ -697,7 +700,7 @@ def test_gradient_noise_is_the_scatter_of_gradients() -> None:
     assert (np.abs(0.5 * ratio - 1.0) > 4.5 * error).all()
 
 
-@pytest.mark.parametrize("loss", [ur.losses.L1(), ur.losses.Huber(0.05)], ids=["L1", "Huber"])
+@pytest.mark.parametrize("loss", quick([ur.losses.L1(), ur.losses.Huber(0.05)], ur.losses.L1()), ids=["L1", "Huber"])
 def test_means_of_models_of_other_losses_average_noise(loss: Any) -> None:
     """The gradient's noise is known to a factor of two; by that of derivative images alone it would be a thirtieth. Without it, models
     would be forgotten as those of another scene."""
@@ -715,7 +718,7 @@ def test_means_of_models_of_other_losses_average_noise(loss: Any) -> None:
     assert all((np.abs(error) < 5.0 * result.standard_error[key]).all() for key, error in errors.items())
 
 
-@pytest.mark.parametrize("remember", [True, False])
+@pytest.mark.parametrize("remember", quick([True, False], True))
 def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool) -> None:
     """An element that hardly changes the picture, with ten times as much noise in its differences."""
     renderer = AnalyticRenderer(TRUTH, MATRIX * np.array([1.0, 1.0, 0.01]), 0.1, 0.0, grain=0.3, shape=(4, 5))
@@ -746,7 +749,7 @@ def test_widths_stay_within_the_bounds() -> None:
     assert state.widths["b"] == pytest.approx(0.125)
 
 
-@pytest.mark.parametrize("earlier", [True, False])
+@pytest.mark.parametrize("earlier", quick([True, False], True))
 def test_weights_leave_skewed_noise_without_bias(earlier: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the truth, with rare bright pixels. The planted fault is weights by the image whose residuals they weight."""
     states = system.Point._states

@@ -200,6 +200,7 @@ def test_a_snapshot_s_image_of_a_state_in_between_is_unbiased() -> None:
     assert worst(np.array(rows), np.array(other)) > 4.2, "the snapshot's own image would have passed"
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba  # a run folder asks for it
 def test_all_four_recover_both_and_resume_to_the_bit(tmp_path: Path) -> None:
     rates = {"*": 0.01, "pose": 0.01}

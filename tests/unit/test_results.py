@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import cache
 
 import pytest
 
@@ -24,15 +25,15 @@ def quoted(page: str) -> Iterator[tuple[str, list[str]]]:
             yield name[1], re.findall(NUMBER, cells)
 
 
+@cache
+def measured(name: str) -> set[str]:
+    """Numbers on the page of a benchmark."""
+    return set(re.findall(NUMBER, section(benchmarks()[name]) or ""))
+
+
 def wrong(page: str) -> list[str]:
     """Numbers that the named benchmark's page does not have."""
-    known = benchmarks()
-    return [
-        f"{name}: {number}"
-        for name, numbers in quoted(page)
-        for number in numbers
-        if number not in re.findall(NUMBER, section(known[name]) or "")
-    ]
+    return [f"{name}: {number}" for name, numbers in quoted(page) for number in numbers if number not in measured(name)]
 
 
 def test_every_number_is_on_its_benchmarks_page() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import quick
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.runs import loop
@@ -67,7 +68,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", quick(ESTIMATORS, "path", "hybrid"))
 def test_texels_beside_saturated_ones_are_not_led_astray(
     name: str, known: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
