@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,6 +81,22 @@ def one_thread(mitsuba_variant: str, threads_as_before: None) -> None:
 
     dr.sync_thread()
     dr.set_thread_count(1)  # `threads_as_before` sets it back
+
+
+@pytest.fixture
+def short_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Render final pictures with one sample, and do not test them: the end takes most of the time of a run of few steps. For tests that
+    look at neither."""
+    from unrender.runs.folder import writer
+
+    render = writer.render_final_images
+
+    def untested(problem: Any, result: Any, spp: Any, left: Any, tested: Any, *more: Any) -> Any:
+        del spp, tested
+        return render(problem, result, 1, left, False, *more)
+
+    monkeypatch.setattr(writer, "render_final_images", untested)
+    monkeypatch.setattr(writer, "warm_up", lambda *_: None)
 
 
 @pytest.fixture(autouse=True)

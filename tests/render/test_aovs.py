@@ -151,6 +151,7 @@ def test_a_mesh_follows_masks() -> None:
     assert end < 0.4 * start
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_file_names_the_aov_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     (tmp_path / "room.xml").write_text(XML)
     np.save(tmp_path / "depth.npy", picture("depth"))

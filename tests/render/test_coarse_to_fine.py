@@ -451,6 +451,7 @@ def uninterrupted(name: str, states: Any) -> ur.Result:
     return ur.optimize(problem(ur.scene.CoarseToFine((3,), states=states)), *PAIRS[name], 6)
 
 
+@pytest.mark.usefixtures("short_ends")
 @pytest.mark.parametrize("at", quick([2, 3, 4], 3))
 @pytest.mark.parametrize(("name", "states"), WITH_STATES)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:
@@ -505,6 +506,7 @@ def planned(given: ur.Problem, **settings: Any) -> Plan:
     return Plan(given, estimator, optimizer, {KEY: ParameterSettings(**settings)})
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_plan_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     """As those of `Parameter`, with states carried; a parameter's own come first."""
     estimator = ur.PathGradient(image=rcv(), spp=2)
@@ -541,6 +543,7 @@ class Ticks:
         return self.now
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_resolutions_follow_the_time_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few steps in the budget bring a plan's changes forward, many or a budget of steps do not; a resumed run knows."""
 

@@ -17,6 +17,8 @@ from tests.campaigns.faults import Killed, operations
 from tests.campaigns.survivors import recording
 from unrender.runs.folder import checkpoint, reader
 
+pytestmark = pytest.mark.usefixtures("short_ends")
+
 RATE, STEPS = "rate", 6
 
 
@@ -92,7 +94,7 @@ def kill_everywhere(
 
 @pytest.mark.usefixtures("no_flush")
 def test_a_run_killed_at_some_file_operations(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    assert kill_everywhere(tmp_path, whole, slice(0, None, 5)) > 100
+    assert kill_everywhere(tmp_path, whole, slice(0, None, 11)) > 100
 
 
 @pytest.mark.slow

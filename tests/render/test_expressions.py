@@ -282,6 +282,7 @@ def file(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_ends")
 def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
     made = ur.Problem.from_file(file(tmp_path))
     assert isinstance(made.renderer, ExpressionRenderer)
@@ -390,6 +391,7 @@ def test_expressions_stand_beside_ties_and_unknowns_of_photographs() -> None:
     np.testing.assert_allclose(ur.render(made, spp=8), ur.render(alone, spp=8), rtol=1e-4)
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
     """Its projection was not evaluated before the functions of it, which gave it their size."""
     unknown = ur.Parameter("strength", initial=1.0, bounds=(0.1, 10.0))

@@ -172,6 +172,7 @@ def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() ->
     np.testing.assert_allclose(result.parameters["cam.aperture_radius"], 0.3, atol=0.05)
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_environment_maps_alone_are_pulled_to_their_start(tmp_path: Path) -> None:
     """They have texels that pictures hardly show. The state of the pull is part of a checkpoint."""
     made, _, _, _ = metal()

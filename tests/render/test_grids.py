@@ -216,6 +216,7 @@ def problem(folder: Path, initial: str, truth: str) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_ends")
 def test_problem_files_name_grids_and_run_folders_keep_them(tmp_path: Path) -> None:
     start, truth = (np.random.default_rng(seed).random((4, 4, 4, 1)).astype(np.float32) for seed in (1, 2))
     (tmp_path / "grids").mkdir()

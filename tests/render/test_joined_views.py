@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.estimators.capabilities import FreshGradient, NoiseSample
@@ -90,7 +91,7 @@ ESTIMATORS: dict[str, tuple[Any, ur.PathGradient, int]] = {
 }
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", quick(ESTIMATORS, "control variate", "damped", "random numbers"))
 def test_views_of_one_launch_are_those_of_separate_launches(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     loss, estimator, count = ESTIMATORS[name]
     asked = problem(loss)
@@ -118,16 +119,17 @@ def test_views_of_one_launch_are_those_of_separate_launches(name: str, monkeypat
 
 
 def kinds(asked: ur.Problem, estimator: ur.PathGradient, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the kinds of the frames of a step."""
+    """Return the kinds of the frames of a step, which ends before they are rendered."""
     found: list[str] = []
-    inner = GradientRequest.estimate_frame
+    inner = GradientRequest.begin
 
-    def noted(self: Any, problem: Any, frame: Any, key: Key) -> Any:
-        found.append(type(frame).__name__)
-        return inner(self, problem, frame, key)
+    def noted(self: Any, problem: Any) -> Any:
+        found.extend(type(frame).__name__ for frame in inner(self, problem).frames)
+        raise StopIteration
 
-    monkeypatch.setattr(GradientRequest, "estimate_frame", noted)
-    steps(asked, estimator, 1)
+    monkeypatch.setattr(GradientRequest, "begin", noted)
+    with pytest.raises(StopIteration):
+        steps(asked, estimator, 1)
     return found
 
 
@@ -162,6 +164,7 @@ def test_a_state_of_separate_views_goes_on_with_them(monkeypatch: pytest.MonkeyP
     assert len(after.image.views) == 4
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_checkpoints_of_separate_and_joined_views_are_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As those of workers and of earlier versions are; with the same launches to the same bits."""
     asked = problem()

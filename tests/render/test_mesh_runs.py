@@ -81,18 +81,23 @@ def test_a_mesh_with_values_at_its_vertices_is_not_remeshed(tmp_path: Path) -> N
         ur.Problem(scene, [unknown], [ur.View(np.zeros((4, 4, 3)))])
 
 
-def test_views_know_their_values_after_a_change_of_triangles() -> None:
-    """Their sensors were those behind the scene's, which `Problem.replaced` and a second change did not find."""
-    scene = {
+def box(bsdf: dict[str, Any]) -> dict[str, Any]:
+    """A cube under a lamp."""
+    return {
         "type": "scene",
         "camera": {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f().look_at([0, 0, 6], [0, 0, 0], [0, 1, 0]),
             "film": {"type": "hdrfilm", "width": 6, "height": 6},
         },
-        "box": {"type": "cube"},
+        "box": {"type": "cube", "bsdf": bsdf},
         "lamp": {"type": "point", "position": [1, 2, 5], "intensity": 9.0},
     }
+
+
+def test_views_know_their_values_after_a_change_of_triangles() -> None:
+    """Their sensors were those behind the scene's, which `Problem.replaced` and a second change did not find."""
+    scene = box({"type": "diffuse"})
     key, lamp, reference = "box.vertex_positions", "lamp.intensity.value", np.full((6, 6, 3), 0.1)
     unknown = ur.Parameter(key, remeshing={"steps": [5], "method": "subdivide"})
     made = ur.Problem(scene, [unknown], [ur.View(reference), ur.View(reference, known={lamp: 1.0})])
@@ -111,18 +116,18 @@ def test_views_know_their_values_after_a_change_of_triangles() -> None:
 
 def test_a_change_of_triangles_restarts_what_is_of_the_mesh_alone() -> None:
     """In whichever part of a partition the mesh is, and not the schedule of a smoothed loss."""
-    made = ur.gallery.problem("statue", resolution=8, subdivisions=1, reference_spp=4, views=1, texture_resolution=4)
-    given = [
-        replace(p, remeshing={"steps": [2], "method": "subdivide"}) if p.key == STATUE else p for p in made.parameters
-    ]
-    problem = Problem(made.renderer.pair.description, given, made.views, made.loss, made.max_depth)  # type: ignore
+    grey = mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))
+    scene = box({"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": grey, "raw": True}})
+    mesh, paint = "box.vertex_positions", "box.bsdf.reflectance.data"
+    given = [ur.Parameter(mesh, remeshing={"steps": [2], "method": "subdivide"}), ur.Parameter(paint)]
+    problem = Problem(scene, given, [ur.View(np.full((6, 6, 3), 0.1))], max_depth=2)
     smoothed = ur.SmoothedDerivatives(0.05, 4, spp=2, schedule=ur.optimizers.schedules.Exponential(2))
-    estimator = ur.estimators.HybridGradient(ur.PathGradient(spp=2), smoothed, keys=(STONE,))
+    estimator = ur.estimators.HybridGradient(ur.PathGradient(spp=2), smoothed, keys=(paint,))
     vertices, texels = ur.optimizers.Adam(0.005, uniform=True), ur.optimizers.Adam(0.02)
     seen = Steps()
-    optimizer = ur.optimizers.Partitioned((STONE,), texels, vertices)
+    optimizer = ur.optimizers.Partitioned((paint,), texels, vertices)
     result = ur.optimize(problem, estimator, optimizer, steps=4, callbacks=[seen])
-    assert [record.get("faces") for record in result.history if "faces" in record] == [{STATUE: 320}]
+    assert [record.get("faces") for record in result.history if "faces" in record] == [{mesh: 48}]
     assert seen.rows == [(1.0, 1, 1), (2.0, 2, 2), (3.0, 3, 1), (4.0, 4, 2)]
 
 
@@ -139,6 +144,7 @@ class Steps(Callback):
         self.rows.append((run.state.estimator.perturbed.age, own, others))
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
     """Problem files have none, so the run folder tells it."""
     film = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
@@ -148,7 +154,8 @@ def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
     made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views)
     surface = Surface(1.1 * made.unknowns[key].initial.reshape(-1, 3), made.faces[key])
     made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views, surfaces={key: surface})
-    ur.optimize(made, "plain", steps=1, run_directory=tmp_path / "run")
+    parts = ur.SmoothedDerivatives(0.05, 2, spp=1), ur.optimizers.Adam(0.01)
+    ur.optimize(made, *parts, steps=1, run_directory=tmp_path / "run")
     before = reader.read(tmp_path / "run").error_before
     result = ur.resume(tmp_path / "run", steps=2)
     assert "parameter_error" in result.history[-1]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import slow
 from unrender.core.errors import InputError
 from unrender.methods import method
 from unrender.methods.plan import Plan
@@ -46,7 +47,7 @@ def problem(truth: float, start: float) -> ur.Problem:
     return ur.Problem(scene(start), [ur.Parameter(KEY)], [ur.View(reference)], max_depth=3)
 
 
-@pytest.mark.parametrize(("truth", "start"), [(0.2, 0.5), (0.85, 0.2)])
+@pytest.mark.parametrize(("truth", "start"), [slow(0.2, 0.5), (0.85, 0.2)])
 def test_a_run_leaves_a_second_minimum(truth: float, start: float, tmp_path: Path) -> None:
     made = problem(truth, start)
     result = ur.optimize(made, steps=60, run_directory=tmp_path / "whole", checkpoint_every=20)

@@ -25,6 +25,8 @@ from unrender.runs.folder.state import Packed, check_alike, pack, unpack
 from unrender.runs.reopen import problem_of
 from unrender.scene.fingerprint import differences, fingerprint
 
+pytestmark = pytest.mark.usefixtures("short_ends")
+
 WALL = "wall.bsdf.reflectance.value"
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective">

@@ -178,7 +178,7 @@ class Stop(ur.protocols.Callback):
 
 @pytest.mark.slow
 @pytest.mark.cpu("atomic additions of a GPU have no order")
-@pytest.mark.usefixtures("one_thread")
+@pytest.mark.usefixtures("one_thread", "short_ends")
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     asked = ur.gallery.problem("mirror-trio", resolution=16, reference_spp=16)
     whole = ur.optimize(asked, adaptive(), ur.optimizers.Adam(0.02), 12)

@@ -17,7 +17,7 @@ from unrender.core import trees
 from unrender.core.random import Key
 from unrender.estimators.penalties import penalized
 
-REPEATS = 12
+REPEATS, SPP = 5, 64
 TEXTS = {features.LEFT: "mix([0.1, 0.1, 0.2], [0.9, 0.8, 0.6], pattern)", features.RIGHT: "0.8 * pattern"}
 
 
@@ -36,14 +36,14 @@ def by_hand(made: ur.Problem, with_priors: bool = True) -> np.ndarray:
         values = {key: mi.TensorXf(value) for key, value in made.initial().items()}
         dr.enable_grad(*values.values())
         stock.write(values)
-        stock.backward(seed, 0, range(len(made.views)), 16, priors(made, values) if with_priors else 0.0)
+        stock.backward(seed, 0, range(len(made.views)), SPP, priors(made, values) if with_priors else 0.0)
         rows.append(trees.ravel({key: dr.grad(value) for key, value in values.items()}))
     return np.array(rows)
 
 
 def by_library(made: ur.Problem) -> np.ndarray:
     """Gradients of `PathGradient`, (REPEATS, 7)."""
-    estimator, at, rows = ur.PathGradient(spp=16), made.initial(), []
+    estimator, at, rows = ur.PathGradient(spp=SPP), made.initial(), []
     state = estimator.init(made, at)
     for seed in range(REPEATS):
         estimate, _ = estimator.estimate(made, at, state, Key(seed))

@@ -66,7 +66,7 @@ def problem(kind: str = "envmap", cameras: int = 1, keys: tuple[str, ...] = (COL
     )
 
 
-@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize("cameras", quick([1, 3], 1))
 @pytest.mark.parametrize("kind", quick(["envmap", "directional"], "envmap"))
 def test_images_and_gradients_are_those_of_scenes_with_the_turned_light(kind: str, cameras: int) -> None:
     ours, keys = problem(kind, cameras, (COLOUR, DATA[kind])), (COLOUR, DATA[kind])
@@ -205,7 +205,7 @@ def test_a_rotation_that_cannot_be_is_one_line(value: Any, expected: str) -> Non
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("sharing", [True, False])
+@pytest.mark.parametrize("sharing", quick([True, False], True))
 def test_turned_views_share_their_kernels(sharing: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one recording, or in one for each view whose time is an input."""
     monkeypatch.setattr(frozen, "_MANY", 3 if sharing else 4)

@@ -249,6 +249,7 @@ def files(folder: Path, more: str) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_ends")
 def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
     worlds = '[[views]]\nreference = "one.npy"\nwith = { "lamp.intensity.value" = [0.5, 0.5, 0.5] }\n'
     worlds += '[[views]]\nreference = "two.npy"\nscene = "other.xml"\n'
@@ -414,6 +415,7 @@ def test_changed_files_of_views_are_differences_and_another_working_directory_is
     assert differences(first, fingerprint(ur.Problem.from_file(file))) == changes
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_scene_of_a_view_made_in_python_is_no_part_of_a_file(tmp_path: Path) -> None:
     """The file was written without it, and the view reopened with the problem's scene."""
     file = files(tmp_path, "")

@@ -24,7 +24,7 @@ from unrender.rendering.mitsuba import scene_pair
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
-RUNS = 24
+RUNS = 12
 FLOOR, LAMP = "floor.bsdf.reflectance.data", "lamp.emitter.radiance.value"
 SKEWED = np.array([0.1, 0.7, 0.2])
 REQUEST = SampleRequest(0, 32, 1, 2)

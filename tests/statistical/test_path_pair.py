@@ -24,30 +24,24 @@ def runs(images: tuple[Any, ...]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", TOGETHER)
-def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
+def test_both_images_of_the_pair_agree_with_separate_renders_and_those_with_mitsuba_path(name: str) -> None:
     description, changes = subject(name)
     renderer = MitsubaRenderer(description, DEPTH)
     current, previous = two_states(renderer, changes)
     session = renderer.prepare(list(current), "path")
     pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
+    singles = []
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
         alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
-        for both, single in zip(tiles(runs(images)), tiles(runs(alone.images)), strict=True):
+        singles.append(runs(alone.images))
+        for both, single in zip(tiles(runs(images)), tiles(singles[-1]), strict=True):
             assert agree(both, single)
-
-
-@pytest.mark.parametrize("name", TOGETHER)
-def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
-    renderer = MitsubaRenderer(subject(name)[0], DEPTH)
-    session = renderer.prepare(["floor.bsdf.reflectance.data"], None)
-    ours = session.image(renderer.values(["floor.bsdf.reflectance.data"]), SampleRequest(0, RUNS * SPP, 1, RUNS))
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
-    theirs = [
-        np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)
-    ]
-    for a, b in zip(tiles(runs(ours.images)), tiles(np.stack(theirs).astype(np.float64)), strict=True):
-        assert agree(a, b)
+    scene = mi.load_dict(subject(name)[0])
+    theirs = runs(tuple(mi.render(scene, integrator=path, spp=SPP, seed=100 + run) for run in range(RUNS)))
+    for ours, stock in zip(tiles(singles[0]), tiles(theirs), strict=True):
+        assert agree(ours, stock)
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 # Dr.Jit's stubs know less than its functions return.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
 
-"""Gradients of pixel mini-batches on a path tracer: the mean of two thousand mini-batches is the gradient of all pixels."""
+"""Gradients of pixel mini-batches on a path tracer: the mean of many mini-batches is the gradient of all pixels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
-RUNS, COUNT = 2000, 48
+RUNS, COUNT = 800, 96
 SCHEMES: dict[str, Any] = {
     "uniform": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(COUNT), spp=2),
     "loss": lambda: ur.PathGradient(pixels=ur.pixels.LossProportional(COUNT), spp=2),
@@ -116,13 +116,13 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
 
 
 def test_first_map_of_a_rough_box_is_as_good_as_that_of_the_loss_derivative() -> None:
-    """Variance over that of uniform pixels, by paths that the maps have not seen: of twelve first maps of each sampler."""
+    """Variance over that of uniform pixels, by paths that the maps have not seen: of eight first maps of each sampler."""
     box = rough_box(reference_spp=256)
     at = box.initial()
-    (moments,) = second_moments(box, at, [np.ones(1)], 1 << 17, 8, Key(0, 7))
+    (moments,) = second_moments(box, at, [np.ones(1)], 1 << 16, 8, Key(0, 7))
 
     def logarithms(sampler: Any) -> np.ndarray:
-        drawn = (sampler.draw(box, at, sampler.init(box, at), Key(seed))[1] for seed in range(12))
+        drawn = (sampler.draw(box, at, sampler.init(box, at), Key(seed))[1] for seed in range(8))
         return np.log([by_paths(moments, pixel_shares(box, sampler, state))[0] for state in drawn])
 
     ours, loss = logarithms(ur.pixels.Adaptive(1000)), logarithms(ur.pixels.LossProportional(1000))
