@@ -19,7 +19,7 @@ from unrender.estimators.base import as_numpy
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
 
 KINDS = ("point", "spot", "projector", "directional", "rectangle", "envmap", "sunsky")
-DEPTH, LEVEL, SPP = 3, 1e-3, 512
+DEPTH, LEVEL, SPP = 3, 1e-3, 1024
 WIDTH = 0.01
 """Half the distance of the differences, in units of the scene, radians, and of the scale as loaded."""
 START = {"translation": [0.1, -0.1, 0.15], "rotation": [0.05, 0.1, -0.08], "scale": 1.1}
