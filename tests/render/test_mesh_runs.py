@@ -154,7 +154,7 @@ def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
     made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views)
     surface = Surface(1.1 * made.unknowns[key].initial.reshape(-1, 3), made.faces[key])
     made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views, surfaces={key: surface})
-    parts = ur.SmoothedDerivatives(0.05, 2, spp=1), ur.optimizers.Adam(0.01)
+    parts = ur.SmoothedDerivatives(0.05, 4, spp=1), ur.optimizers.Adam(0.01)
     ur.optimize(made, *parts, steps=1, run_directory=tmp_path / "run")
     before = reader.read(tmp_path / "run").error_before
     result = ur.resume(tmp_path / "run", steps=2)
