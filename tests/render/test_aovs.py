@@ -95,10 +95,23 @@ def test_values_are_those_of_mitsubas_integrator(renderer: MitsubaRenderer) -> N
     assert mask[SIZE // 2, SIZE // 2] == pytest.approx(1.0)
 
 
+def leaf() -> dict[str, Any]:
+    """A rectangle with an opacity mask in front of the ball."""
+    place = mi.ScalarTransform4f().translate([0.4, 0.3, 1.0]).scale(0.3)
+    return {
+        "leaf": {
+            "type": "rectangle",
+            "to_world": place,
+            "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}},
+        }
+    }
+
+
 @pytest.mark.parametrize("name", quick(AOVS, "depth"))
-def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRenderer, name: str) -> None:
+@pytest.mark.parametrize("masked", quick([False, True], True))
+def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRenderer, name: str, masked: bool) -> None:
     """The ball grows and is shifted: silhouettes move. Without them the derivative of all but the albedo would be wrong."""
-    of = renderer.with_aov(name)
+    of = (MitsubaRenderer(lambda: scene(**leaf()), 3, [BALL]) if masked else renderer).with_aov(name)
     positions = of.values([BALL])[BALL].numpy().reshape(-1, 3)
     weights = np.random.default_rng(1).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
     along = positions + np.array([0.7, 0.2, 0.0], np.float32)
@@ -138,6 +151,15 @@ def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     made = problem([ur.View(picture(name, x=0.3), aov=name)], ("ball.translation.x",))
     result = ur.optimize(made, ur.GaussNewton(16, derivative_spp=8), ur.optimizers.AveragedNewton(), steps=15)
     assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.03)
+
+
+def test_a_mesh_may_move_beside_opacity_masks_where_no_view_has_colour() -> None:
+    """It was refused: the renderer of colour, which no view uses, has no such derivative."""
+    depth = ur.View(np.ones((SIZE, SIZE)), aov="depth")
+    made = ur.Problem(scene(**leaf()), [ur.Parameter(BALL)], [depth])
+    assert ur.optimize(made, "plain", steps=1, progress=False).steps == 1
+    with pytest.raises(InputError, match="do not support opacity masks"):
+        ur.optimize(made.replaced(views=[depth, ur.View(np.ones((SIZE, SIZE, 3)))]), "plain", steps=1, progress=False)
 
 
 @pytest.mark.slow

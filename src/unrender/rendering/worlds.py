@@ -51,22 +51,23 @@ class World:
         return all(np.array_equal(value, other.values[key]) for key, value in self.values.items())
 
 
-def with_worlds(renderer: Renderer, worlds: Sequence[World]) -> tuple[Renderer, list[int]]:
-    """Return a renderer with a sensor for each world, inside its wrappers, and their indices; itself if it has them already."""
+def with_worlds(renderer: Renderer, worlds: Sequence[World], bare: bool = True) -> tuple[Renderer, list[int]]:
+    """Return a renderer with a sensor for each world, inside its wrappers, and their indices; itself if it has them already. `bare` is
+    that of `WorldsRenderer`."""
     if not worlds:
         return renderer, []
     if isinstance(renderer, WorldsRenderer):
         if (known := renderer.sensors_of(worlds)) is not None:
             return renderer, known
-        return with_worlds(renderer.inner, worlds)
+        return with_worlds(renderer.inner, worlds, bare)
     if isinstance(renderer, RendererWrapper):
-        inner, sensors = with_worlds(renderer.inner, worlds)
+        inner, sensors = with_worlds(renderer.inner, worlds, bare)
         return (renderer if inner is renderer.inner else renderer.around(inner)), sensors
     distinct: list[World] = []
     for world in worlds:
         if not any(world.same(other) for other in distinct):
             distinct.append(world)
-    made = WorldsRenderer(renderer, distinct)
+    made = WorldsRenderer(renderer, distinct, bare)
     return made, made.sensors_of(worlds) or []
 
 
@@ -79,10 +80,13 @@ class WorldsRenderer(RendererWrapper):
     Args:
         inner: Renders the scene that has all parameters.
         worlds: One for each further sensor.
+        bare: Whether views use the sensors of `inner` too. If not, its session is prepared when it is needed: it may lack derivatives
+            that the worlds have, such as those of depth beside opacity masks.
     """
 
-    def __init__(self, inner: Renderer, worlds: Sequence[World]):
+    def __init__(self, inner: Renderer, worlds: Sequence[World], bare: bool = True):
         super().__init__(inner)
+        self._bare = bare or any(world.renderer is inner for world in worlds)
         self.worlds = tuple(worlds)
         self.max_depth = getattr(inner, "max_depth", 6)
         self._count = len(inner.resolutions())
@@ -142,12 +146,17 @@ class WorldsRenderer(RendererWrapper):
         return [*own, *(format_of(world.renderer, world.sensor) for world in self.worlds)]
 
     def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
-        differentiable, sessions = differentiated(keys, derivatives), {}
-        for renderer in self.renderers:
+        differentiable = differentiated(keys, derivatives)
+
+        def prepared(renderer: Renderer) -> RenderSession:
             known = renderer.parameters()
             own = list(dict.fromkeys([*(key for key in keys if key in known), *self.known_keys(renderer)]))
-            sessions[id(renderer)] = renderer.prepare(own, space, differentiable & frozenset(own))
-        return WorldsSession(self, sessions, differentiable)
+            return renderer.prepare(own, space, differentiable & frozenset(own))
+
+        session = WorldsSession(self, prepared, differentiable)
+        for renderer in self.renderers[0 if self._bare else 1 :]:
+            session.of(renderer)
+        return session
 
     def known_keys(self, renderer: Renderer) -> list[str]:
         """Return the keys for which a world of this renderer has a known value."""
@@ -187,7 +196,7 @@ class WorldsRenderer(RendererWrapper):
 
     def _changed(self, change: Callable[[Renderer], Renderer]) -> WorldsRenderer:
         worlds = [replace(world, renderer=change(world.renderer)) for world in self.worlds]
-        return WorldsRenderer(change(self.inner), worlds)
+        return WorldsRenderer(change(self.inner), worlds, self._bare)
 
     def _only(self, sensor: int) -> int | None:
         """Return the only sensor that renders with a sensor of the first scene; None where several do."""
@@ -221,8 +230,11 @@ class _Part:
 class WorldsSession:
     """Images and derivatives of views of different worlds. See `RenderSession`."""
 
-    def __init__(self, renderer: WorldsRenderer, sessions: Mapping[int, RenderSession], differentiable: frozenset[str]):
-        self._renderer, self._sessions, self._differentiable = renderer, sessions, differentiable
+    def __init__(
+        self, renderer: WorldsRenderer, prepare: Callable[[Renderer], RenderSession], differentiable: frozenset[str]
+    ):
+        self._renderer, self._prepare, self._differentiable = renderer, prepare, differentiable
+        self._sessions: dict[int, RenderSession] = {}
         self._known = [{key: renderer.array(x) for key, x in state.values.items()} for state in renderer.states]
         self._keys = [frozenset(state.renderer.parameters()) for state in renderer.states]
         self._own = [state.renderer.values(renderer.known_keys(state.renderer)) for state in renderer.states]
@@ -282,7 +294,7 @@ class WorldsSession:
     def emitters(self) -> np.ndarray:
         """Return the probabilities of the emitters. Raises `InputError` if there are several scenes, or the session supports no other
         ones."""
-        if len(self._sessions) > 1:
+        if len(self._renderer.renderers) > 1:
             raise InputError("views of several scenes do not support learned emitter sampling")
         return drawing_emitters(self._session(0)).emitters()
 
@@ -298,7 +310,13 @@ class WorldsSession:
         return sum(moments[1:], moments[0])
 
     def _session(self, state: int) -> RenderSession:
-        return self._sessions[id(self._renderer.states[state].renderer)]
+        return self.of(self._renderer.states[state].renderer)
+
+    def of(self, renderer: Renderer) -> RenderSession:
+        """Return the session of one of the renderers, prepared at the first call."""
+        if id(renderer) not in self._sessions:
+            self._sessions[id(renderer)] = self._prepare(renderer)
+        return self._sessions[id(renderer)]
 
     def _at(self, state: int, parameters: Tree) -> Tree:
         """Return the parameters of a state's session: those that its scene has, with the known values."""

@@ -62,7 +62,7 @@ def of_views(
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
         worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
-    made, sensors = with_worlds(renderer, list(worlds.values()))
+    made, sensors = with_worlds(renderer, list(worlds.values()), len(worlds) < len(views))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
         replace(view, sensor=located[index], known=None, scene=None, aov=None) if index in located else view

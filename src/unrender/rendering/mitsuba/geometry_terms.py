@@ -41,20 +41,21 @@ def moved_shape(scene: LoadedScene, key: str) -> str:
     return owner if name == POSITIONS else ""
 
 
-def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
-    """Return {target: reason why a moving shape has no boundary derivative, "" if it has one}."""
+def obstacles(pair: ScenePair, targets: Iterable[str], aov: str = "") -> dict[str, str]:
+    """Return {target: reason why a moving shape has no boundary derivative, "" if it has one}: of radiance, or of an AOV, in which masks
+    and glass are as any surface."""
     shapes = {shape.id(): shape for shape in pair.current.shapes()}
-    return {target: _obstacle(pair, target, shapes.get(target)) for target in targets}
+    return {target: _obstacle(pair, target, shapes.get(target), aov) for target in targets}
 
 
-def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
+def _obstacle(pair: ScenePair, target: str, shape: Any, aov: str) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes do not support media"
     if is_spectral():
         return "path gradients of moving shapes do not support spectral variants"
     if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
         return "path gradients of moving shapes do not support sample_border: leave it out of the film"
-    if reason := _masks_obstacle(pair):
+    if not aov and (reason := _masks_obstacle(pair)):
         return reason
     if shape is None:
         return "path gradients do not support moving instances"
@@ -63,7 +64,7 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     known = pair.current_parameters
     if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in (POSITIONS, "to_world")):
         return f"{target} is not a mesh ({shape.class_name()}); boundary derivatives are limited to meshes"
-    if is_mirror_or_glass(shape.bsdf()):
+    if not aov and is_mirror_or_glass(shape.bsdf()):
         return MOVED_MIRROR
     kinds = [sensor.class_name() for sensor in pair.current.sensors()]
     if "PerspectiveCamera" not in kinds:

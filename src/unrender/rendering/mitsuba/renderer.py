@@ -290,7 +290,7 @@ class MitsubaRenderer:
         """Return {shape or sensor that moves: reason why it has no path gradient, "" if it has one}."""
         sensors = {sensor.id() for sensor in self.pair.current.sensors() if sensor.get_shape() is None}
         lights = {emitter.id() for emitter in self.pair.current.emitters() if emitter.get_shape() is None}
-        result = obstacles(self.pair, targets - sensors - lights)
+        result = obstacles(self.pair, targets - sensors - lights, self.light_paths.aov)
         result |= {target: sensor_obstacle(self.pair, target) for target in targets & sensors}
         return result | dict.fromkeys(targets & lights, "path gradients do not support it")
 
