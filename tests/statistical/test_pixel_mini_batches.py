@@ -20,7 +20,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
-RUNS, COUNT = 2000, 48
+RUNS, COUNT = 800, 96
 SCHEMES: dict[str, Any] = {
     "uniform": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(COUNT), spp=2),
     "loss": lambda: ur.PathGradient(pixels=ur.pixels.LossProportional(COUNT), spp=2),
