@@ -199,6 +199,19 @@ def test_the_slope_of_the_references_has_the_weights_of_the_pictures():
     assert dataclasses.replace(plain, weights=(half,)).slope() == pytest.approx(np.sqrt(upper), rel=1e-4)
 
 
+def test_errors_beside_a_number_that_may_be_anywhere_are_lower_limits():
+    """A lamp's position was said to be known to ± 0.14, 0.84 off, beside an intensity that nothing determined."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, at(best(made, MATRIX)), made.initial_values())
+    assert numbers is not None
+    for last, words in ((0.06, "± 0.001, 0.2, 0.001 (with"), (5.0, "± 0.001, 0.2, 0.001 or more (with")):
+        error = np.array([0.001, 0.2, 0.001, last])
+        found = _checked(
+            numbers, _Fit(np.diag(error**2), error, error, np.zeros(4), np.zeros((4, 0))), np.full(4, 0.01)
+        )
+        assert words in found.undetermined["a"]
+
+
 def test_a_run_that_arrived_is_told_nothing():
     made = problem(MATRIX)
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), FAR)

@@ -331,7 +331,7 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     of_step = np.maximum(error, own)  # references without noise leave the noise of this check
     outside = np.abs(fit.beyond) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
     further = (np.abs(fit.step) > least) & ~outside.any()  # more steps lead no further than the bound
-    shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
+    shown, more = np.minimum(error, sizes), " or more" * bool((error > sizes).any())  # not linear beside an open number
     # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
     moved = np.abs(numbers.tangents()[:n, :n] @ (numbers.point[:n] - numbers.start))
     refuted = (moved > _FAR * of_step) & (fit.better < _BETTER)
@@ -351,7 +351,7 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
             others += [*numbers.fields] if shared[of].any() else []
             together_with = f", together with {listed(others)}" if others else ""
-            limit = f"determines it to ± {_numbers(shown[of])}{max(more[of])}"
+            limit = f"determines it to ± {_numbers(shown[of])}{more}"
             found = limit if (error <= sizes)[of].any() else "does not determine it"
             undetermined[key] = (
                 f"{key}: a least-squares test at the end {found}{together_with} (with the noise of the references and of the test); fix "
