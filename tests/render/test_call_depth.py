@@ -57,11 +57,13 @@ def holders() -> set[str]:
     """Kinds of our objects with an attribute that is a problem."""
     found = set()
     for each in gc.get_objects():
-        if isinstance(each, type) or not str(getattr(type(each), "__module__", "")).startswith("unrender."):
+        # `isinstance` reads attributes of the object, and one of PyTorch's warns then that it is deprecated.
+        kind = type(each)
+        if issubclass(kind, type) or not str(getattr(kind, "__module__", "")).startswith("unrender."):
             continue
         for name, value in getattr(each, "__dict__", {}).items():
             if isinstance(value, Problem):
-                found.add(f"{type(each).__name__}.{name}")
+                found.add(f"{kind.__name__}.{name}")
     return found
 
 
