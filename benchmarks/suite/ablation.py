@@ -40,10 +40,13 @@ def _without_cache(plan: Plan) -> Plan:
 
 
 def _without_newton(plan: Plan) -> Plan:
-    """Return the plan without the rules that take Gauss-Newton steps for all unknowns."""
+    """Return the plan without the rules that take Gauss-Newton steps for all unknowns, and without such steps after path gradients."""
     rules = tuple(rule for rule in auto.RULES if rule.__module__ != newton.__name__)
     with patch.object(auto, "RULES", rules):
-        return method("auto").plan(plan.problem)
+        made = method("auto").plan(plan.problem)
+    if not isinstance(made.estimator, ur.estimators.PathThenNewton):
+        return made
+    return replace(made, estimator=made.estimator.path, optimizer=made.optimizer.first)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 PARTS: dict[str, dict[str, str] | Callable[[Plan], Plan]] = {

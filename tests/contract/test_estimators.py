@@ -86,6 +86,9 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     ),
     "loss values": lambda: ur.estimators.LossValues(spp=4),
     "Gauss-Newton": lambda: ur.GaussNewton(spp=8, derivative_spp=4),
+    "paths, then Gauss-Newton": lambda: ur.estimators.PathThenNewton(
+        ur.PathGradient(spp=6), ur.GaussNewton(spp=8, derivative_spp=4)
+    ),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
@@ -152,6 +155,9 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
     "Partitioned": lambda: ur.optimizers.Partitioned((), OPTIMIZERS["SGD"](), OPTIMIZERS["ScheduleFree"]()),
 }
+OPTIMIZERS["Successive"] = lambda: ur.optimizers.Successive(
+    OPTIMIZERS["ScheduleFree"](), OPTIMIZERS["AveragedNewton"]()
+)
 OPTIMIZERS |= others("optimizer")
 FITTING = [
     (estimator, optimizer)

@@ -20,6 +20,7 @@ from unrender.estimators.capabilities import Hessian, HessianNoise
 from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
+from unrender.estimators.path_then_newton import PathThenNewton
 from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.io import toml_lines
 from unrender.methods import auto as module
@@ -368,7 +369,7 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     renderer = AnalyticRenderer(truth, matrix, 0.1, 0.3, shape=SHAPE)
     unknown = [Parameter(key, initial=0.2) for key in truth]
     made = Problem(renderer, unknown, [View(renderer.exact(truth))], truth=truth)
-    assert isinstance(chosen(made)[0], PathGradient)
+    assert isinstance(chosen(made)[0], PathThenNewton)
     known = renderer.parameters()
     formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
@@ -415,7 +416,7 @@ def test_numbers_of_bsdfs_take_gauss_newton_steps_on_small_films_or_without_path
     if not reached:
         monkeypatch.setattr("unrender.methods.rules.traits.refusal", lambda problem: "no path gradient of rough")
     else:
-        assert isinstance(chosen(made)[0], PathGradient)
+        assert isinstance(chosen(made)[0], PathThenNewton)
     known = dict(renderer.parameters())
     known["rough"] = dataclasses.replace(known["rough"], scattering="bsdf")
     known["colour"] = dataclasses.replace(known["colour"], brightness="reflectance")
@@ -425,6 +426,9 @@ def test_numbers_of_bsdfs_take_gauss_newton_steps_on_small_films_or_without_path
     assert ("not linear in rough" in plan.reasons[0]) == newton
     absolute = Problem(renderer, unknown, made.views, loss=losses.L1())
     assert isinstance(chosen(absolute)[0], GaussNewton) != reached
+    assert isinstance(chosen(absolute)[0], PathGradient) == reached
+    one = Problem(renderer, unknown[:1], made.views)
+    assert isinstance(chosen(one)[0], PathGradient) == reached
 
 
 LIT = {

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient, StockGradient
+    from unrender.estimators.path_then_newton import PathThenNewton
     from unrender.estimators.smoothed import SmoothedDerivatives
 
 __getattr__, _ = lazy.attach(
@@ -20,6 +21,7 @@ __getattr__, _ = lazy.attach(
         "LossValues": "loss_values",
         "MetaEstimator": "meta",
         "PathGradient": "path",
+        "PathThenNewton": "path_then_newton",
         "SmoothedDerivatives": "smoothed",
         "StockGradient": "path",
     },
@@ -30,6 +32,7 @@ __all__ = [
     "LossValues",
     "MetaEstimator",
     "PathGradient",
+    "PathThenNewton",
     "SmoothedDerivatives",
     "StockGradient",
 ]

@@ -17,9 +17,6 @@ _RESIDUAL_ERRORS = 2.0  # standard errors of the sum of squared residuals from w
 _VALUES = 1 << 22  # maximum number of image values that are converted to double precision at once
 _MEMORY, _CHANNEL_MEMORY = 0.3, 0.1
 """Weight of the latest image in the running mean of the variance of a pixel, and of one of its channels, which has more noise itself."""
-_MOST_NOISE = 0.1
-"""Relative noise of mean derivative images above which every step has new ones. Source: `uncertainty.numbers`, `glass`, 24 seeds: RMS error
-0.092, without it 0.112."""
 _LAUNCH = 1 << 13
 """Time of starting a render, in that of paths: 4,000 to 19,000 on two cores, for four scenes of `suite.numbers`."""
 _GROWTH = 1.0  # weights of derivative images in their mean grow as this power of their number
@@ -153,15 +150,14 @@ def needs_derivatives(noise: float, images: float, derivatives: float, image: in
     """Return whether another derivative image reduces the error more than images for the same time would.
 
     With N images and K derivative images the variance is proportional to (1 + ν / K) / N. The time that a derivative image takes reduces
-    it by ν / K² or, with images, by c / N, for the ratio c of the two times. Above `_MOST_NOISE` derivative images are always worth it:
-    ν / K also multiplies the references' noise, which no image reduces.
+    it by ν / K² or, with images, by c / N, for the ratio c of the two times.
 
     Args:
         noise: noise of the mean derivative images relative to the derivatives, ν / K.
         images, derivatives: effective numbers of both, N and K.
         image, derivative: time of an image, and of all renders of differences, see `cost`.
     """
-    return noise > _MOST_NOISE or noise * images * image > derivatives * derivative
+    return noise * images * image > derivatives * derivative
 
 
 def cost(paths: int, renders: int) -> int:

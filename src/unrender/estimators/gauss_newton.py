@@ -125,6 +125,8 @@ class GaussNewton:
         remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
             small relative to the derivatives also for elements that hardly change the image. Steps have no new derivative images where
             images reduce the error more in the same time. Not for large pictures of many elements.
+        derivative_noise: noise of mean derivative images, relative to the derivatives, above which every step has new ones if they are
+            averaged, > 0. It also multiplies the references' noise, which no image reduces.
         scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
             `MOST_AVERAGED` pixels in all views have no scores, since the mean takes 24 bytes per pixel. Runs whose optimizer states no
             errors do without.
@@ -141,6 +143,7 @@ class GaussNewton:
     noise_limit: Positive | None = None
     by_channel: bool = False
     remember: bool = False
+    derivative_noise: Positive = 0.1
     scores: bool = True
     derivative_images: bool = False
 
@@ -225,7 +228,9 @@ class GaussNewton:
         renders = 2 * point.theta.size
         image = cost(point.problem.pixels * self.spp, 2)
         derivative = cost(point.problem.pixels * renders * self.derivative_spp, 2 * renders)
-        return needs_derivatives(state.noise, state.images, state.derivatives[0].count, image, derivative)
+        return state.noise > self.derivative_noise or needs_derivatives(
+            state.noise, state.images, state.derivatives[0].count, image, derivative
+        )
 
     def _sharpened(self, state: GaussNewtonState, point: np.ndarray, moved: float) -> GaussNewtonState:
         """Return the state at a point, with half the shift if the last step was short relative to the widths."""

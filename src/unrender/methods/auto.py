@@ -47,6 +47,7 @@ class AutoMethod(Options):
     | environment maps | a weak pull to the start, for texels that pictures hardly show | |
     | vertices | large steps, one rate for all | |
     | cameras; up to 24 numbers, one of a light or of the picture's form | Gauss-Newton steps | `image` |
+    | 2 to 24 other numbers, linear loss | Gauss-Newton steps once path gradients no longer agree | `image` |
     | poses, and what path gradients refuse | perturbed renders: Gauss-Newton steps, or a smoothed loss | `sigma` |
     | poses on a plateau | the best of 16 to 64 places of each shape | |
     """

@@ -9,6 +9,7 @@ from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.newton import Newton, NewtonCG
 from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.recipes import SGD, Adam, MetaAdam, ScheduleFree
+from unrender.optimizers.successive import Successive
 
 __all__ = [
     "CMAES",
@@ -23,5 +24,6 @@ __all__ = [
     "Optimizer",
     "Partitioned",
     "ScheduleFree",
+    "Successive",
     "schedules",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -209,8 +210,9 @@ class AveragedNewton:
             state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, scores,
         )  # fmt: skip
 
-    def averages(self, keys: Iterable[str]) -> frozenset[str]:
+    def averages(self, keys: Iterable[str], state: Any = None) -> frozenset[str]:
         """Return all keys."""
+        del state
         return frozenset(keys)
 
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:

@@ -47,14 +47,14 @@ class Measuring(Protocol):
 class Averaging(Protocol):
     """An optimizer whose steps lead some parameters to a mean over all steps."""
 
-    def averages(self, keys: Iterable[str]) -> frozenset[str]:
-        """Return those of these parameters that it averages."""
+    def averages(self, keys: Iterable[str], state: Any = None) -> frozenset[str]:
+        """Return those of these parameters that it averages, in this state if it is known."""
         ...
 
 
-def averaged_by(optimizer: Optimizer, keys: Iterable[str]) -> frozenset[str]:
-    """Return the parameters that the optimizer averages itself."""
-    return optimizer.averages(keys) if isinstance(optimizer, Averaging) else frozenset()
+def averaged_by(optimizer: Optimizer, keys: Iterable[str], state: Any = None) -> frozenset[str]:
+    """Return the parameters that the optimizer averages itself, in this state if it is known."""
+    return optimizer.averages(keys, state) if isinstance(optimizer, Averaging) else frozenset()
 
 
 @runtime_checkable

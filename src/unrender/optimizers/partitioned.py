@@ -117,8 +117,9 @@ class Partitioned:
             restarted(state.others, fresh.others) if others else state.others,
         )
 
-    def averages(self, keys: Iterable[str]) -> frozenset[str]:
+    def averages(self, keys: Iterable[str], state: PartitionedState | None = None) -> frozenset[str]:
         """Return the keys that one of the two optimizers averages."""
+        del state
         all_keys = frozenset(keys)
         return averaged_by(self.optimizer, all_keys.intersection(self.keys)) | averaged_by(
             self.others, all_keys.difference(self.keys)

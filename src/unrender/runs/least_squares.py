@@ -21,6 +21,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
+from unrender.estimators.path_then_newton import PathThenNewton, PathThenNewtonState
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
@@ -84,8 +85,7 @@ def check_numbers(
         start: {key: array} at the start.
         seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
-        weights: weights of each view's pixels in the steps of the run, see `pixel_weights`; () for equal ones.
-            A fit with other weights has another solution, and the distance from it would count as an error of the run.
+        weights: weights of each view's pixels in the run's steps (`pixel_weights`); () if equal. A fit with others has another solution.
     """
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
@@ -101,8 +101,10 @@ def check_numbers(
 def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
     """Return the weights of each view's pixels in the next step, (H, W, 1) or (H, W, 3), from the noise of earlier images; () if equal.
 
-    Only `GaussNewton` with a `noise_limit` has weights, alone or for the numbers of a `HybridGradient`.
+    Only `GaussNewton` with a `noise_limit` has weights, alone, for the numbers of a `HybridGradient`, or at the end of a `PathThenNewton`.
     """
+    if isinstance(estimator, PathThenNewton) and isinstance(state, PathThenNewtonState) and state.changed:
+        estimator, state = estimator.newton, state.newton
     if isinstance(estimator, HybridGradient) and isinstance(state, HybridState):
         estimator, state = estimator.perturbed, state.perturbed
     if not (isinstance(estimator, GaussNewton) and isinstance(state, GaussNewtonState) and estimator.noise_limit):

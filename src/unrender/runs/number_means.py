@@ -87,15 +87,15 @@ class NumberMeans(Callback):
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         del record
-        if shapes := numbers_of(run.problem, run.optimizer):
+        if shapes := numbers_of(run.problem, run.optimizer, run.state.optimizer):
             values = [arrays.numpy(run.parameters[key]).astype(np.float64).ravel() for key in shapes]
             run.state.numbers.append(np.concatenate(values))
 
 
-def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the numbers and colours of a problem, without those that the optimizer averages itself."""
+def numbers_of(problem: Problem, optimizer: Any, state: Any = None) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the numbers and colours of a problem, without those that the optimizer averages itself in a state."""
     shapes = problem.shapes()
-    own = averaged_by(optimizer, shapes)
+    own = averaged_by(optimizer, shapes, state)
     numbers = {
         key: shape
         for key, shape in shapes.items()
@@ -111,7 +111,7 @@ def averaged(run: Run, result: Result) -> Result:
     Neither are there any of a few steps with control variates.
     """
     trace = run.state.numbers
-    shapes = numbers_of(run.problem, run.optimizer)
+    shapes = numbers_of(run.problem, run.optimizer, run.state.optimizer)
     if not shapes or not trace.rows:
         return result
     last = {key: result.parameters[key] for key in shapes}

@@ -5,9 +5,9 @@ unknowns of each kind, and those in `sampling` decide how images are rendered.
 """
 
 from unrender.methods.rules.newton import cameras, cameras_by_paths, few_numbers
-from unrender.methods.rules.paths import paths, paths_and_perturbed, perturbed
+from unrender.methods.rules.paths import paths_and_perturbed, paths_then_newton, perturbed
 
 __all__ = ["RULES"]
 
-RULES = (cameras, cameras_by_paths, few_numbers, paths_and_perturbed, perturbed, paths)
+RULES = (cameras, cameras_by_paths, few_numbers, paths_and_perturbed, perturbed, paths_then_newton)
 """Functions from a problem's traits to a plan, or None."""

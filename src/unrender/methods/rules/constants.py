@@ -175,6 +175,8 @@ class Constants:
     Poses of `stage-lights` end further away with it, since noisy bright pixels lead the first steps; and so do three numbers of a fog, 0.38
     of the start's error in place of 0.24 (`suite.numbers`).
     """
+    derivative_noise: float = 1.0
+    """`GaussNewton.derivative_noise` after path gradients, where derivative images take most of a step. Source: by hand."""
     averaged_values: int = MOST_AVERAGED
     """Elements times pixels up to which the derivative images of such steps are averaged over steps. Source: memory, 12 MiB."""
     pose_averaging: float = 3.0

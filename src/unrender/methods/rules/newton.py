@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from unrender import pixels
 from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.core.text import listed
@@ -16,6 +17,7 @@ from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
+from unrender.estimators.path_then_newton import PathThenNewton
 from unrender.estimators.variable_projection import IMAGES, can_be_eliminated
 from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
@@ -28,6 +30,8 @@ from unrender.methods.smoothed import widths_of
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.recipes import Adam
+from unrender.optimizers.successive import Successive
+from unrender.scene.executor import LocalExecutor
 from unrender.scene.problem import Problem
 from unrender.schedules import Exponential
 from unrender.statistics.scores import positive_inverse
@@ -88,9 +92,7 @@ def few_numbers(traits: Traits) -> Plan | None:
         return None
     estimator = _estimator(traits, keys, constants.pose_images if shapes else constants.number_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
-    media = any(info.scattering == "medium" for info in traits.infos.values())
-    if _only_scattering_and_brightness(traits) and not media:
-        estimator = replace(estimator, noise_limit=constants.bsdf_noise_limit, by_channel=True)
+    estimator = _by_channel(traits, estimator)
     plateau = False
     if traits.poses:
         trial = replace(
@@ -149,6 +151,46 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
         reasons=(reason, *plan.reasons),
     )
     return best_start(traits, keys, made)
+
+
+def then_newton(traits: Traits, plan: Plan) -> Plan:
+    """Return a plan of path gradients with Gauss-Newton steps after them if few numbers are unknown, else the plan itself."""
+    constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
+    averaged = traits.elements * problem.pixels <= constants.averaged_values
+    path, local = plan.estimator, isinstance(problem.executor, LocalExecutor)
+    if not (isinstance(path, PathGradient) and isinstance(path.pixels, pixels.All) and averaged and local):
+        return plan
+    # One number, and images with a control variate of L1, end as near by path gradients.
+    suits = traits.elements > 1 and problem.loss.linear and traits.newton_suits and not traits.poses
+    if not (suits and _few(traits, keys)):
+        return plan
+    newton = replace(
+        _estimator(traits, keys, 0.0),
+        spp=max(
+            traits.options.spp or sampling.within(constants.number_spp, constants.number_paths // problem.pixels), 2
+        ),
+        derivative_spp=sampling.within(
+            constants.difference_spp, constants.number_paths // (traits.elements * problem.pixels)
+        ),
+        remember=True,
+        derivative_noise=constants.derivative_noise,
+    )
+    newton = _by_channel(traits, newton)
+    reason = f"later {_reason(traits, keys, newton)}, from when path gradients no longer agree"
+    return replace(
+        plan,
+        estimator=PathThenNewton(path, newton),
+        optimizer=Successive(plan.optimizer, _optimizer(traits, keys)),
+        reasons=(*plan.reasons, reason),
+    )
+
+
+def _by_channel(traits: Traits, estimator: GaussNewton) -> GaussNewton:
+    """Return the estimator with weights by channel if all unknowns are numbers of BSDFs and brightnesses, without media."""
+    media = any(info.scattering == "medium" for info in traits.infos.values())
+    if media or not _only_scattering_and_brightness(traits):
+        return estimator
+    return replace(estimator, noise_limit=traits.constants.bsdf_noise_limit, by_channel=True)
 
 
 def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:

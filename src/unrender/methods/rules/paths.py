@@ -25,7 +25,7 @@ from unrender.methods.base import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
 from unrender.methods.rules.constants import CONSTANTS, Constants
-from unrender.methods.rules.newton import with_separate_block
+from unrender.methods.rules.newton import then_newton, with_separate_block
 from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import first_steps, parse_widths
 from unrender.optimizers.base import Optimizer
@@ -176,6 +176,11 @@ def perturbed(traits: Traits) -> Plan | None:
     reason = f"derivatives of a smoothed loss (method smoothed): {traits.unreachable}"
     plan = method("smoothed").configure({"sigma": traits.options.sigma}).plan(traits.problem)
     return replace(plan, reasons=(reason,))
+
+
+def paths_then_newton(traits: Traits) -> Plan:
+    """Return path gradients, with Gauss-Newton steps after them for few numbers."""
+    return then_newton(traits, paths(traits))
 
 
 def paths(traits: Traits) -> Plan:

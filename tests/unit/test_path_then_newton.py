@@ -1,0 +1,122 @@
+"""Path gradients of few numbers, and Gauss-Newton steps once these agree no more."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from tests.analytic import AnalyticRenderer
+from unrender.estimators import GaussNewton, PathThenNewton
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Hessian, HessianNoise
+from unrender.methods import method
+from unrender.methods.plan import Plan, PlanFile, plan_text
+
+TRUTH = {"gain": np.array([0.5, 0.3, 0.7], np.float32)}
+SHAPE = (8, 8)
+
+
+def problem(noise: float = 4.0) -> ur.Problem:
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 3))
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, noise, shape=SHAPE)
+    unknown = ur.Parameter("gain", initial=0.2, bounds=(0.0, 1.0))
+    view = ur.View(renderer.exact(TRUTH))
+    return ur.Problem(renderer, [unknown], [view], truth=TRUTH)
+
+
+def plan(made: ur.Problem) -> Plan:
+    """Return the plan of `auto`, with images of few samples, as on large films."""
+    chosen = method("auto").plan(made)
+    assert isinstance(chosen.estimator, PathThenNewton)
+    newton = dataclasses.replace(chosen.estimator.newton, spp=32, derivative_spp=4)
+    path = dataclasses.replace(chosen.estimator.path, spp=4)
+    return dataclasses.replace(chosen, estimator=PathThenNewton(path, newton))
+
+
+class Change(ur.protocols.Callback):
+    """Steps before the first Gauss-Newton step, steps before trials, and errors by step."""
+
+    def __init__(self) -> None:
+        self.at: int | None = None
+        self.trials: list[int] = []
+        self.errors: list[float] = []
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        state = run.state.estimator
+        self.errors.append(float(np.linalg.norm(run.full()["gain"] - TRUTH["gain"])))
+        if state.changed and self.at is None:
+            self.at = record["step"]
+        if state.trial and state.trial // 2 not in self.trials:
+            self.trials.append(state.trial // 2)
+
+
+def losses(result: ur.Result) -> list[float]:
+    return [record["loss"] for record in result.history]
+
+
+def test_path_gradients_come_first_and_gauss_newton_steps_end_nearer() -> None:
+    """Until the change the run is that of path gradients, to the bit. At its end the error is at most half of that at the change."""
+    made, ends = problem(), []
+    both = plan(made)
+    assert "later Gauss-Newton steps" in both.reasons[-1]
+    for seed in range(4):
+        change = Change()
+        found = ur.optimize(made, both, steps=60, seed=seed, callbacks=[change], progress=False)
+        assert change.at is not None
+        assert 4 < change.at < 40
+        paths = both.estimator.path, both.optimizer.first  # pyright: ignore[reportAttributeAccessIssue]
+        first = ur.optimize(made, *paths, steps=change.at, seed=seed, progress=False)
+        assert losses(first) == losses(found)[: change.at]
+        assert found.parameters is found.last, "its steps are a mean"
+        ends.append([change.errors[-1], change.errors[change.at - 1]])
+        scores = (found.parameters["gain"] - TRUTH["gain"]) / found.standard_error["gain"]
+        assert (np.abs(scores) < 5.0).all()
+    end, before = np.sqrt(np.mean(np.square(ends), axis=0))
+    assert end < 0.5 * before
+
+
+@pytest.mark.mitsuba  # which a run folder asks for its version
+def test_a_plan_in_a_file_makes_the_same_run_and_a_run_resumes_to_the_bit(tmp_path: Path) -> None:
+    """Once before and once after the change."""
+    made, change = problem(), Change()
+    both = plan(made)
+    whole = ur.optimize(made, both, steps=45, callbacks=[change], progress=False)
+    assert change.at is not None
+    (tmp_path / "own.toml").write_text(plan_text(both))
+    for steps in (change.at - 2, change.at + 3):
+        folder = tmp_path / str(steps)
+        again = PlanFile(tmp_path / "own.toml").plan(made)
+        ur.optimize(made, again, steps=steps, run_directory=folder, progress=False)
+        ended = ur.resume(folder, problem(), steps=45)
+        assert losses(ended) == losses(whole)
+        np.testing.assert_array_equal(ended.parameters["gain"], whole.parameters["gain"])
+
+
+@pytest.mark.parametrize("noise", [1e3, np.nan])
+def test_derivative_images_that_are_noise_leave_path_gradients(monkeypatch: pytest.MonkeyPatch, noise: float) -> None:
+    """They are tried again after twice as many steps."""
+    made, change = problem(), Change()
+    both, estimate = plan(made), GaussNewton.estimate
+
+    def noisy(*arguments: Any) -> tuple[Estimate, Any]:
+        found, state = estimate(*arguments)
+        planted = HessianNoise(noise * np.asarray(found.require("", Hessian).matrix))
+        kept = tuple(one for one in found.capabilities if not isinstance(one, HessianNoise))
+        return dataclasses.replace(found, capabilities=(*kept, planted)), state
+
+    monkeypatch.setattr(GaussNewton, "estimate", noisy)
+    found = ur.optimize(made, both, steps=80, callbacks=[change], progress=False)
+    paths = both.estimator.path, both.optimizer.first  # pyright: ignore[reportAttributeAccessIssue]
+    first = ur.optimize(made, *paths, steps=80, progress=False)
+    assert change.at is None
+    assert len(change.trials) > 1
+    assert all(later >= 2 * earlier for earlier, later in itertools.pairwise(change.trials))
+    assert losses(found) == losses(first)
+    np.testing.assert_array_equal(found.parameters["gain"], first.parameters["gain"])
+    assert found.history[-1]["samples"] > first.history[-1]["samples"], "a trial traces paths"
