@@ -83,13 +83,12 @@ def test_few_frames_lead_from_the_command_to_a_bounce(
     assert not recorder.faults()
 
 
-@pytest.mark.parametrize("words", [["-m", "plain"], slow([])], ids=["plain", "auto"])
 def test_few_frames_lead_to_a_bounce_that_is_traced_at_each_step(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frozen, "_recorder", lambda function, tracing: None)
     recorder = Recorder(monkeypatch)
-    run(tmp_path / "run", *POSTER, *words)
+    run(tmp_path / "run", *POSTER)
     assert any(name.endswith(":_step") for chain in recorder.chains for name in chain)
     assert not recorder.faults()
 
@@ -102,5 +101,5 @@ def test_a_call_that_only_forwards_is_noticed(tmp_path: Path, monkeypatch: pytes
     forwarding = space["forwarding"]
     monkeypatch.setattr(frozen.FrozenFunction, "__call__", forwarding(forwarding(frozen.FrozenFunction.__call__)))
     recorder = Recorder(monkeypatch)
-    run(tmp_path / "run", *POSTER, "-m", "plain")
+    run(tmp_path / "run", *POSTER)
     assert "planted.py:call > " in recorder.faults()
