@@ -155,6 +155,7 @@ def test_run_says_what_was_done_to_the_input_and_warns_of_a_parameter_without_in
     problem.write_text(text + '[[parameters]]\nkey = "hidden.bsdf.reflectance.value"\n')
     answer = unrender("run", "problem.toml", "--steps", 8, "--variant", mitsuba_variant, *QUICK)
     assert answer.status == 0
+    assert names(problem.parent / "out") == ["problem-auto"]
     assert "note: view 0: reference photo.png: 8-bit sRGB, linearised" in answer.out
     assert "warning parameter hidden.bsdf.reflectance.value: its gradient is zero" in answer.out
 
