@@ -66,6 +66,7 @@ def problem(
         ("2 * a + b", [2 + 3.0, 4 + 3.0]),
         ("a ** 2 - b / 4", [1 - 0.75, 4 - 0.75]),
         ("-a[1] + [1, 2] + b ** 0.5 * 0", [-1.0, 0.0]),
+        ("(a * a) ** 0.25 - b ** 0.75 * 0", [1.0, 2**0.5]),
         ("exp(log(a)) + sqrt(b) * 0", [1.0, 2.0]),
         ("max(a, 1.5) + min(b, 2)", [3.5, 4.0]),
         ("mix(a, b, 0.25) + abs(sin(0)) + cos(0) - 1 + tanh(0)", [1.5, 2.25]),
@@ -308,6 +309,8 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),
         ({"expression": "sqrt(strength - 1)"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.5"}, r"its derivative by strength is not finite at the initial values"),
+        ({"expression": "(strength - 1) ** 0.3"}, r"its derivative by strength is not finite at the initial values"),
+        ({"expression": "(strength - 1) ** 0.75"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "strength * [1, 2]"}, r"has the shape \(2,\), lamp.intensity.value has \(3,\)"),
         ({"key": "lamp.colour"}, r"the scene has no parameter lamp.colour"),
         ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs an initial value"),
@@ -347,9 +350,15 @@ def test_what_is_no_function_of_tensors_is_refused_in_one_line(expressions: Any,
 
 @pytest.mark.parametrize("loses", [dr.detach, lambda x: mi.TensorXf(x.numpy())])
 def test_a_function_that_loses_its_derivative_has_no_path_gradient(loses: Any) -> None:
-    """The run ended at its start as "finished". Perturbed renders need no derivative."""
-    expressions = {LEFT: lambda values: loses(values["strength"]) * mi.TensorXf([1, 0.8, 0.6])}
-    made = problem(picture(), expressions, ur.Parameter("strength", initial=1.0))
+    """The run ended at its start as "finished". Perturbed renders need no derivative. The start of a problem evaluates it once."""
+    calls: list[Any] = []
+
+    def function(values: Any) -> Any:
+        calls.append(values)
+        return loses(values["strength"]) * mi.TensorXf([1, 0.8, 0.6])
+
+    made = problem(picture(), {LEFT: function}, ur.Parameter("strength", initial=1.0))
+    assert len(calls) == 1
     with pytest.raises(InputError, match=r"by path gradients, since the function of left\.intensity\.value loses its"):
         ur.optimize(made, "plain", steps=1, progress=False)
     assert "perturbed renders" in method("auto").plan(made).lines[0]

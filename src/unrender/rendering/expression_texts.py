@@ -28,14 +28,19 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "tanh": (1, dr.tanh),
 }
 """Functions of the text form, with the number of their arguments."""
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Return a ** b. For numbers b between 0 and 1 the derivative at 0 is infinite, where Dr.Jit's is 0."""
+    return dr.select(a == 0.0, dr.sqrt(a), a**b) if isinstance(b, float) and 0.0 < b < 1.0 else a**b
+
+
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: lambda a, b: a + b,
     ast.Sub: lambda a, b: a - b,
     ast.Mult: lambda a, b: a * b,
     ast.Div: lambda a, b: a / b,
-    ast.Pow: lambda a, b: (
-        dr.sqrt(a) if isinstance(b, float) and b == 0.5 else a**b
-    ),  # Dr.Jit's derivative of 0 ** 0.5 is 0
+    ast.Pow: _power,
 }
 _LONGEST, _DEEPEST = 1000, 50  # characters and nesting of a text form
 

@@ -91,12 +91,12 @@ class ExpressionRenderer(RendererWrapper):
             raise InputError(f"{unread}: neither a parameter of the scene nor read by an expression")
         targets = {name: [key for key, names in self.reads.items() if name in names] for name in self.unknowns}
         infos = {name: _info(self.unknowns[name].shape, [known[key] for key in keys]) for name, keys in targets.items()}
-        lost: dict[str, str] = {}
-        for name, keys in targets.items():
-            reads = _Reads({**start, **_leaves({name: start[name]})})
-            results = _evaluated(self.expressions, keys, reads, known)
-            if without := [key for key, x in results.items() if not dr.grad_enabled(x)]:
-                lost[name] = without[0]
+        lost = {
+            name: key
+            for key, names in self.reads.items()
+            for name, differentiable in names.items()
+            if not differentiable
+        }
         for name, key in lost.items():
             reason = f"the function of {key} loses its derivative; compute with the Dr.Jit tensors that it gets"
             infos[name] = replace(infos[name], differentiable=False, reason=reason)
@@ -142,16 +142,18 @@ class ExpressionRenderer(RendererWrapper):
         rest = {key: value for key, value in values.items() if key not in self.unknowns}
         return rest | ({key: arrays.numpy(x) for key, x in self.evaluated(own).items()} if own else {})
 
-    def _checked(self, one: Expression, known: Mapping[str, ParameterInfo], start: Tree) -> tuple[str, ...]:
-        """Return the names that an expression reads."""
+    def _checked(self, one: Expression, known: Mapping[str, ParameterInfo], start: Tree) -> dict[str, bool]:
+        """Return the names that an expression reads, and whether it has a derivative by each."""
         if one.key not in known:
             raise KeyedError(one.key, f"the scene has no parameter {one.key}{did_you_mean(one.key, known)}")
         info = known[one.key]
         if not (info.perturbable or info.differentiable):
             raise KeyedError(one.key, f"{one.key} cannot be a function: {info.reason}")
-        reads = _Reads(start)
+        leaves = _leaves(start)
+        reads = _Reads(leaves)
         try:
-            value = arrays.numpy(_shaped(one, reads, info.shape))
+            result = _shaped(one, reads, info.shape)
+            value = arrays.numpy(dr.detach(result))
         except KeyError as error:
             hint = did_you_mean(str(error.args[0]), start)
             raise KeyedError(one.key, f"no parameter is called {error.args[0]}{hint}") from error
@@ -169,16 +171,18 @@ class ExpressionRenderer(RendererWrapper):
             )
         if not reads.names:
             raise KeyedError(one.key, "it reads no unknown; set the value in the scene")
-        leaves = _leaves({name: start[name] for name in reads.names})
-        result: Any = dr.sum(_shaped(one, _Reads({**start, **leaves}), info.shape), axis=None)
-        if dr.grad_enabled(result):
-            dr.backward(result)
-            if endless := [name for name, x in leaves.items() if not np.isfinite(arrays.numpy(dr.grad(x))).all()]:
-                raise KeyedError(
-                    one.key,
-                    f"its derivative by {listed(endless)} is not finite at the initial values, as that of a root at 0; start elsewhere",
-                )
-        return tuple(reads.names)
+        names = tuple(reads.names)
+        if not dr.grad_enabled(result):
+            return dict.fromkeys(names, False)
+        dr.backward(dr.sum(result, axis=None))
+        if endless := [name for name in names if not np.isfinite(arrays.numpy(dr.grad(leaves[name]))).all()]:
+            raise KeyedError(
+                one.key,
+                f"its derivative by {listed(endless)} is not finite at the initial values, as that of a root at 0; start elsewhere",
+            )
+        alone = ({**start, **_leaves({name: start[name]})} for name in names if len(names) > 1)
+        kept = [dr.grad_enabled(_shaped(one, _Reads(values), info.shape)) for values in alone] or [True]
+        return dict(zip(names, kept, strict=True))
 
 
 def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
