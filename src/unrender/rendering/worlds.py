@@ -54,15 +54,15 @@ class World:
 def with_worlds(renderer: Renderer, worlds: Sequence[World], bare: bool = True) -> tuple[Renderer, list[int]]:
     """Return a renderer with a sensor for each world, inside its wrappers, and their indices; itself if it has them already. `bare` is
     that of `WorldsRenderer`."""
-    if not worlds:
-        return renderer, []
     if isinstance(renderer, WorldsRenderer):
-        if (known := renderer.sensors_of(worlds)) is not None:
+        if (known := renderer.sensors_of(worlds)) is not None and (renderer.bare or not bare):
             return renderer, known
         return with_worlds(renderer.inner, worlds, bare)
     if isinstance(renderer, RendererWrapper):
         inner, sensors = with_worlds(renderer.inner, worlds, bare)
         return (renderer if inner is renderer.inner else renderer.around(inner)), sensors
+    if not worlds:
+        return renderer, []
     distinct: list[World] = []
     for world in worlds:
         if not any(world.same(other) for other in distinct):
@@ -86,7 +86,7 @@ class WorldsRenderer(RendererWrapper):
 
     def __init__(self, inner: Renderer, worlds: Sequence[World], bare: bool = True):
         super().__init__(inner)
-        self._bare = bare or any(world.renderer is inner for world in worlds)
+        self.bare = bare or any(world.renderer is inner for world in worlds)
         self.worlds = tuple(worlds)
         self.max_depth = getattr(inner, "max_depth", 6)
         self._count = len(inner.resolutions())
@@ -111,7 +111,8 @@ class WorldsRenderer(RendererWrapper):
 
     @property
     def notices(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(line for one in self.renderers for line in getattr(one, "notices", ())))
+        used = self.renderers[0 if self.bare else 1 :]
+        return tuple(dict.fromkeys(line for one in used for line in getattr(one, "notices", ())))
 
     def state_of(self, sensor: int) -> World:
         """Return a world with the scene and the known values of a sensor."""
@@ -154,7 +155,7 @@ class WorldsRenderer(RendererWrapper):
             return renderer.prepare(own, space, differentiable & frozenset(own))
 
         session = WorldsSession(self, prepared, differentiable)
-        for renderer in self.renderers[0 if self._bare else 1 :]:
+        for renderer in self.renderers[0 if self.bare else 1 :]:
             session.of(renderer)
         return session
 
@@ -196,7 +197,7 @@ class WorldsRenderer(RendererWrapper):
 
     def _changed(self, change: Callable[[Renderer], Renderer]) -> WorldsRenderer:
         worlds = [replace(world, renderer=change(world.renderer)) for world in self.worlds]
-        return WorldsRenderer(change(self.inner), worlds, self._bare)
+        return WorldsRenderer(change(self.inner), worlds, self.bare)
 
     def _only(self, sensor: int) -> int | None:
         """Return the only sensor that renders with a sensor of the first scene; None where several do."""

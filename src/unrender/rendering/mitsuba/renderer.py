@@ -92,19 +92,23 @@ class MitsubaRenderer:
         self.pair = ScenePair(description, moving_targets(keys), replaced, turns)
         self.light_paths = LightPaths.of(self.pair.current, self.pair.volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
+        scene, graph = self.pair.current, self.pair.loaded().graph
+        self._surface_notices = (
+            *graph.missing_attributes(),
+            *merge_notices(keys, self.pair.loaded().equal),
+            *contact_notices(scene, keys),
+            *jump_notices(scene, graph, keys),
+            *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
+        )
         self.notices = (
             *self.light_paths.notices,
-            *self.pair.loaded().graph.missing_attributes(),
-            *merge_notices(keys, self.pair.loaded().equal),
-            *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
-            *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
-            *unbounded_notices(self.pair.current),
-            *copied_media_notices(self.pair.current, self.pair.loaded().graph, keys),
-            *contact_notices(self.pair.current, keys),
-            *specular_notices(self.pair.current, keys),
-            *shadow_notices(self.pair.current, keys),
-            *jump_notices(self.pair.current, self.pair.loaded().graph, keys),
-            *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
+            *mask_notices(scene, graph.of("bsdf"), keys),
+            *null_notices(scene, graph.of("bsdf"), self.pair.volumetric, self.max_depth),
+            *unbounded_notices(scene),
+            *copied_media_notices(scene, graph, keys),
+            *specular_notices(scene, keys),
+            *shadow_notices(scene, keys),
+            *self._surface_notices,
         )
         self._formats = formats(self.pair.current.sensors())
         self._poses = self._pose_keys()
@@ -231,6 +235,7 @@ class MitsubaRenderer:
             raise InputError(f"{name}: spectral variants render radiance only; leave it out, or use an RGB variant")
         if name not in self._aovs:
             renderer = self._aovs[name] = copy.copy(self)
+            renderer.notices = self._surface_notices  # an AOV has no light paths
             renderer.light_paths = LightPaths(1, hide_emitters=self.light_paths.hide_emitters, aov=name)
             renderer._formats, renderer._sessions = [PictureFormat(signed=True, aov=name)] * len(self._formats), {}
             renderer._checked, renderer._differential = set(), None
