@@ -27,6 +27,8 @@ _MEMORY = 0.8
 """Decay of the mean correlation of successive gradients and of their mean square, as in `AgreementRate`."""
 _AGREEMENT = 0.5
 """Mean correlation below which path gradients are noise or oppose each other, and `AgreementRate` raises no rate."""
+_CLEAR, _LONGEST_WAIT = 2.0, 16.0
+"""Ratio of noise to curvature below which a trial is a step; largest factor of the steps until the next trial."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,9 @@ class PathThenNewton:
 
     A path gradient costs little, so it is ahead while gradients agree. Near the solution it is mostly noise, and a Gauss-Newton step is the
     better average. Derivative images are tried as soon as the mean correlation of successive gradients falls below one half and the steps
-    so far took at least the time of that trial. If curvatures are positive, and noise is less than twice the derivatives, the trial is the
-    first Gauss-Newton step. Otherwise the next trial follows after twice as many steps. The first differences are as wide as the parameters
-    have moved so far.
+    so far took at least the time of that trial. If curvatures are positive, and noise adds less than twice as much to them, the trial is
+    the first Gauss-Newton step. Otherwise the next trial follows after twice as many steps, or after as many times the steps as noise
+    exceeds the curvature, at most 16. The first differences are as wide as the parameters have moved so far.
 
     A Gauss-Newton step is a `BlockEstimate` of all parameters. An optimizer such as `Successive` therefore takes both kinds of steps.
 
@@ -112,12 +114,14 @@ class PathThenNewton:
             begun = state.newton if state.newton.widths else self._begun(problem, parameters, state)
             estimate, newton = self.newton.estimate(problem, parameters, begun, own)
             state = replace(state, newton=newton)
-            if state.changed or _is_clear(estimate):
+            noise = 0.0 if state.changed else _noise(estimate)
+            if noise < _CLEAR:
                 if not state.changed:  # control variates of earlier parameters are no pictures of the end
                     state = replace(state, path=self.path.init(problem, parameters), changed=True)
                 block = BlockEstimate(tuple(parameters), estimate)
                 return replace(estimate, capabilities=(block,)), replace(state, step=state.step + 1)
-            tried, state = int(estimate.info["samples"]), replace(state, trial=2 * state.step)
+            wait = min(max(noise, 2.0), _LONGEST_WAIT)
+            tried, state = int(estimate.info["samples"]), replace(state, trial=math.ceil(wait * state.step))
         estimate, path = self.path.estimate(problem, parameters, state.path, key)
         estimate = replace(
             estimate,
@@ -144,17 +148,17 @@ class PathThenNewton:
         return replace(state.newton, widths=widths, shift=self.newton.coarse or self.newton.shift, point=point.theta)
 
 
-def _is_clear(estimate: Estimate) -> bool:
-    """Return whether all curvatures are positive, and one more set of derivative images leaves less noise than derivatives."""
+def _noise(estimate: Estimate) -> float:
+    """Return the mean ratio of what noise adds to a curvature to the curvature; infinite unless all curvatures are positive."""
     hessian, noise = (
         arrays.numpy(estimate.require("PathThenNewton", kind).matrix).astype(np.float64)
         for kind in (Hessian, HessianNoise)
     )
     if not (np.isfinite(hessian).all() and np.isfinite(noise).all()):
-        return False
+        return math.inf
     scales, curvatures, directions = scaled_eigh(hessian)
     added = np.einsum("ki,kl,li->i", directions, noise / scales, directions)
-    return bool((curvatures > 0.0).all()) and float((added / curvatures).mean()) < 2.0
+    return float((added / curvatures).mean()) if (curvatures > 0.0).all() else math.inf
 
 
 def _observed(state: PathThenNewtonState, gradient: np.ndarray) -> PathThenNewtonState:
