@@ -52,8 +52,9 @@ _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 """Time limit of each of two tests of undetermined parameters relative to the time of the steps, and its minimum in seconds."""
 _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
-_NUMBERS_SHARE = 0.05
-"""Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
+_NUMBERS_SHARE, _NUMBERS_COUNTED = 0.05, 2.0
+"""Time limit of least squares of few numbers relative to the time of the steps, and its minimum if renderings are counted: for four numbers
+and up to 90 x 90 pixels it takes 1.5. Otherwise the minimum is a second."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
@@ -249,7 +250,8 @@ def _undetermined(
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
-    numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
+    of_numbers = max(allowed, _NUMBERS_COUNTED) if timing.counts() else allowed
+    numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights)
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
