@@ -22,8 +22,8 @@ from unrender.scene.render import as_tree, selected_views, view_request
 from unrender.statistics.debiased import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
-ADJOINT = 1.5
-"""Time of an adjoint relative to a rendering."""
+ADJOINT, _BOUNDARY = 1.5, (6, 24)
+"""Time of an adjoint relative to a rendering; the same, and launches, of the boundary term of poses and vertices."""
 MAP_AXES = 3
 """Number of axes from which a parameter is a texture or grid."""
 FEWEST_PROBES = 8
@@ -339,10 +339,13 @@ def adjoints(
     """Return {key: Jᵀx, (k, *shape)} of k pictures x (k, H, W, 3) for each view of `seeds`, from one rendering of the view."""
     count = len(pictures[0])
     sums = {key: np.zeros((count, *shape)) for key, shape in problem.shapes().items() if key in keys}
+    known = problem.renderer.parameters()
+    paths, launches = _BOUNDARY if any(known[key].rigid or known[key].welded for key in sums) else (0, 0)
     for (view, seed), parts in zip(seeds.items(), pictures, strict=True):
         rendering = session.image(parameters, view_request(problem, view, spp, seed.uint32()))
         shape = arrays.shape(rendering.images)
-        timing.add((1.0 + ADJOINT * count) * spp * math.prod(problem.sizes[view]), 1 + count)
+        cost = (1.0 + (ADJOINT + paths) * count) * spp * math.prod(problem.sizes[view]), 1 + (1 + launches) * count
+        timing.add(*cost)
         for index, part in enumerate(parts):
             weights = problem.renderer.array(part.astype(np.float32).reshape(shape))
             gradient = session.adjoint(parameters, rendering.paths, weights)
