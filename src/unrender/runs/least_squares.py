@@ -328,11 +328,11 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
     # A hidden slope has an upper limit alone, so an error from it is a lower limit.
-    blind = fit.blind > np.maximum(error, fit.own)
-    own = np.where(blind, np.inf, fit.own)
+    own = np.where(blind := fit.blind > np.maximum(error, fit.own), np.inf, fit.own)
     of_step = np.maximum(error, own)  # references without noise leave the noise of this check
-    outside = np.abs(fit.beyond) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
-    further = (np.abs(fit.step) > least) & ~outside.any()  # more steps lead no further than the bound
+    far = np.abs(fit.step) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
+    outside = (np.abs(fit.beyond) > least) & ~far  # a step from far away may be too long
+    further = far & ~outside.any()  # more steps lead no further than the bound
     shown, more = np.minimum(error, sizes), " or more" * bool((error > sizes).any())  # not linear beside an open number
     # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
     moved = np.abs(numbers.tangents()[:n, :n] @ (numbers.point[:n] - numbers.start))
@@ -368,32 +368,31 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     known = np.where((error > sizes) | refuted | (fit.beyond != 0.0), np.inf, error)
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
-    if line := _distorted(numbers, fit, of_step):
+    if line := _distorted(numbers, fit, of_step, bool((further | refuted).any())):
         return NumbersCheck({}, unfinished, {}, steps, noise, numbers.keys, distorted=line)
     return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
 
 
-def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray) -> str:
-    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,); "" for none."""
+def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, unsettled: bool) -> str:
+    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,); "" for none. Where numbers
+    are `unsettled`, their pictures may differ as if distorted."""
     moves = np.broadcast_to(fit.moves, of_step.shape)
     moved = [
         f"{key} by {_numbers(moves[of])}"
         for key, of in numbers.places().items()
         if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
     ]
-    if not moved:
-        return ""
-    return (
+    line = (
         f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references as if {fit.distortion}, which would move "
-        f"{listed(moved)}; check the references and the camera"
+        f"{listed(moved)}; {'give more steps or another start, then ' * unsettled}check the references and the camera"
     )
+    return line if moved else ""
 
 
 def _shared_with_fields(covariance: np.ndarray, n: int) -> np.ndarray:
     """Return which of n numbers would have less than half their standard error if factors of textures and grids were known, (n,)."""
     own, shared, factors = covariance[:n, :n], covariance[:n, n:], covariance[n:, n:]
-    known = np.diag(own - shared @ np.linalg.pinv(factors, hermitian=True) @ shared.T)
-    return known < 0.25 * np.diag(own)
+    return np.diag(own - shared @ np.linalg.pinv(factors, hermitian=True) @ shared.T) < 0.25 * np.diag(own)
 
 
 def _numbers(values: np.ndarray) -> str:
