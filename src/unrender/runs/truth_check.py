@@ -44,7 +44,9 @@ def with_few_steps(problem: Problem, result: Result) -> Result:
     """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them."""
     unknown = [key for key in problem.unknowns if key not in result.standard_error]
     lines = (*result.warnings, *result.undetermined)
-    told = any(words in line for words in ("more steps", "more seconds", "of at least") for line in lines)
+    told = any(
+        words in line for words in ("more steps", "more seconds", "of at least", "allows about") for line in lines
+    )
     if result.status != "finished" or told or not unknown or not 0 < result.steps < FEW_NEWTON_STEPS:
         return result
     steps = "1 step is" if result.steps == 1 else f"{result.steps} steps are"
