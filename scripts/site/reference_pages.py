@@ -77,7 +77,7 @@ print(estimate.loss, estimate.gradient)
 """,
         (
             *("class PathGradient", "class MetaEstimator", "class SmoothedDerivatives", "class GaussNewton"),
-            "class unrender.estimators.HybridGradient",
+            *("class unrender.estimators.HybridGradient", "class unrender.estimators.PathThenNewton"),
             *("class unrender.estimators.LossValues", "class unrender.estimators.StockGradient"),
         ),
     ),
