@@ -280,6 +280,7 @@ def test_every_derivative_of_an_estimate_has_the_priors_part() -> None:
         ({"smoothness": 0.1}, "need a texture, a volume or vertices"),
         ({"smooth": 0.1}, "smooth"),
         (3.0, "expected a table such as"),
+        ({"near": True, "std": 0.5}, 'near must be a number, one number per channel, or "initial", got True'),
         ({"near": 5, "std": 0.5}, "near: expected at least 0 and at most 1 as the unknown's bounds, got 5"),
         ({"palette": [[128.0, 0.2, 0.1]], "std": 0.5}, "palette: expected at least 0 and at most 1 as the unknown's"),
     ],

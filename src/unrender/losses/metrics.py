@@ -102,8 +102,8 @@ def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
 
 
 def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree. Raises `InputError` without
-    its package."""
+    """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree; smaller is better. Raises
+    `InputError` without its package."""
     try:
         import flip_evaluator
     except ImportError as error:

@@ -74,7 +74,7 @@ class Prior:
             raise InputError("prior: near or palette needs std, and std needs one of these")
         if not pulled and self.smoothness is None and self.total_variation is None:
             raise InputError("prior: expected near, palette, smoothness or total_variation")
-        if isinstance(self.near, str) and self.near != "initial":
+        if isinstance(self.near, (str, bool)) and self.near != "initial":
             raise InputError(
                 f'prior: near must be a number, one number per channel, or "initial", got {self.near!r:.60}'
             )
