@@ -39,7 +39,7 @@ WHOLE = [
     name
     for name in ESTIMATORS
     if not any(word in name for word in ("pixels", "counts", "all four", "denoised"))  # all four: pixels among them
-    and name != "Gauss-Newton"
+    and "Gauss-Newton" not in name
 ]
 
 

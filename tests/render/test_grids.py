@@ -176,7 +176,7 @@ def test_a_vol_file_is_scaled_and_an_array_is_not(tmp_path: Path) -> None:
 MISFITS = [
     ((4, 3, 5, 3), "a grid of 2 channels cannot fill a parameter of 3"),
     ((4, 3, 2), r"a grid cannot fill a parameter of shape \(4, 3, 2\)"),
-    ((3,), r"a grid cannot fill a parameter of shape \(3,\), expected a number or a colour"),
+    ((3,), r"a grid cannot fill a parameter of shape \(3,\), expected a number or 3 numbers"),
 ]
 
 

@@ -161,7 +161,7 @@ def test_a_folder_that_vanishes_is_a_warning_and_is_not_brought_back(problem, tm
     result = descend(problem, [gone, Live(folder)])
     assert result.steps == 6
     assert not folder.exists()
-    (warning,) = result.warnings
+    (warning,) = [one for one in result.warnings if "too few to judge" not in one]
     assert "can no longer be watched" in warning
 
 
@@ -270,7 +270,7 @@ def test_a_disk_that_is_full_is_a_warning_and_the_run_goes_on(problem, tmp_path,
     monkeypatch.setattr(module.files, "write", write)
     result = descend(problem, [Live(tmp_path)])
     assert result.steps == 6
-    (warning,) = result.warnings
+    (warning,) = [one for one in result.warnings if "too few to judge" not in one]
     assert "No space left on device" in warning
     assert "\n" not in warning
 

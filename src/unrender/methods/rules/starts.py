@@ -36,7 +36,7 @@ _MOTIONS = ("translation", "rotation", "scale")
 """Parts of the keys of poses, after the name of what they move."""
 _POSITION = "position"
 """Last part of the keys of positions of lights without a pose."""
-_NORMALS, _TRANSFORM, _ROUNDING = "vertex_normals", "to_", 1e-4
+_NORMALS, _TRANSFORM, _ROUNDING = "_normals", "to_", 1e-4
 """Last part of the keys of normals, and its beginning for transforms, which are not compared; largest difference of equal positions,
 relative to a shape's size."""
 _FACTORS = (1e-2, 1e2)
