@@ -180,9 +180,11 @@ class ExpressionRenderer(RendererWrapper):
                 one.key,
                 f"its derivative by {listed(endless)} is not finite at the initial values, as that of a root at 0; start elsewhere",
             )
-        alone = ({**start, **_leaves({name: start[name]})} for name in names if len(names) > 1)
-        kept = [dr.grad_enabled(_shaped(one, _Reads(values), info.shape)) for values in alone] or [True]
-        return dict(zip(names, kept, strict=True))
+        if len(names) == 1:
+            return {names[0]: True}
+        # A sum has a derivative if one of its terms has: each unknown is tried without the others'.
+        alone = {name: _Reads({**start, **_leaves({name: start[name]})}) for name in names}
+        return {name: dr.grad_enabled(_shaped(one, reads, info.shape)) for name, reads in alone.items()}
 
 
 def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
