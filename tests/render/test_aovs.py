@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from unrender.scene.fingerprint import fingerprint
 
 pytestmark = pytest.mark.mitsuba
 
-SIZE, BALL, FLOOR = 8, "ball.vertex_positions", "floor.bsdf.reflectance.value"
+SIZE, BALL, FLOOR, MOVES = 8, "ball.vertex_positions", "floor.bsdf.reflectance.value", "floor.translation.z"
 CHANNELS = {"depth": 1, "position": 3, "sh_normal": 3, "albedo": 3}
 
 
@@ -182,7 +183,7 @@ def test_a_mesh_follows_masks() -> None:
 def test_a_file_names_the_aov_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     (tmp_path / "room.xml").write_text(XML)
     np.save(tmp_path / "depth.npy", picture("depth"))
-    lines = ['scene = "room.xml"', "[[parameters]]", f'key = "{FLOOR}"', "[[views]]", 'reference = "depth.npy"']
+    lines = ['scene = "room.xml"', "[[parameters]]", f'key = "{MOVES}"', "[[views]]", 'reference = "depth.npy"']
     (tmp_path / "problem.toml").write_text("\n".join([*lines, 'aov = "depth"']))
     made = ur.Problem.from_file(tmp_path / "problem.toml")
     (tmp_path / "other.toml").write_text("\n".join([*lines, 'aov = "mask"']))
@@ -200,11 +201,11 @@ def test_masks_may_be_alpha_and_integers() -> None:
     cut = np.full((SIZE, SIZE, 4), 128, np.uint8)
     cut[..., 3] = coverage
     for given in (coverage, cut, coverage > 0, coverage / 255.0):
-        view = problem([ur.View(given, aov="mask")]).views[0]
+        view = problem([ur.View(given, aov="mask")], (MOVES,)).views[0]
         np.testing.assert_allclose(np.asarray(view.reference)[..., 0], coverage / 255.0)
         assert view.mask is None
     with pytest.raises(InputError, match=r"view 0: reference: its largest value is 0\.0039: expected 1 where"):
-        problem([ur.View(coverage // 255, aov="mask")])
+        problem([ur.View(coverage // 255, aov="mask")], (MOVES,))
 
 
 XML = f"""<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/>
@@ -242,6 +243,34 @@ def test_what_has_no_such_pictures_is_refused() -> None:
     made = problem(views, ("camera.rotation.y",))
     with pytest.raises(InputError, match="path gradients of moving sensors do not support depth"):
         ur.optimize(made, "plain", steps=1)
+
+
+DEPTH = ur.View(np.zeros((SIZE, SIZE)), aov="depth")
+DARK = ur.View(np.zeros((SIZE, SIZE, 3)), known={"light.intensity.value": 0.0})
+UNSEEN: list[tuple[str, list[ur.View], str]] = [
+    (FLOOR, [DEPTH], "view 0 has the aov depth, which does not show it"),
+    ("light.intensity.value", [replace(DEPTH, aov="albedo")], "view 0 has the aov albedo"),
+    ("light.translation", [DEPTH, replace(DEPTH, aov="mask")], "view 0 has the aov depth, .* view 1 has the aov mask"),
+    ("light.intensity.value", [DARK, DEPTH], "view 0 knows it, view 1 has the aov depth"),
+    ("strength", [DARK, DEPTH], "view 0 knows it, view 1 has the aov depth"),
+    (BALL.replace("positions", "normals"), [DEPTH], "view 0 has the aov depth"),
+    ("other.rotation.y", [DARK], "view 0 has sensor 0, and it moves sensor 1"),
+]
+
+
+@pytest.mark.parametrize(("key", "views", "message"), UNSEEN)
+def test_an_unknown_that_no_view_shows_is_refused(key: str, views: list[ur.View], message: str) -> None:
+    """A run ended with the initial value, and said so in its last lines."""
+    second = {"other": scene()["camera"]} if key.startswith("other") else {}
+    derived = {"expressions": {"light.intensity.value": "strength"}} if key == "strength" else {}
+
+    def made(*more: ur.View) -> ur.Problem:
+        unknown = ur.Parameter(key, initial=1.0 if derived else None)
+        return ur.Problem(lambda: scene(ball={"type": "cube"}, **second), [unknown], [*views, *more], **derived)
+
+    with pytest.raises(InputError, match=rf"parameters\[0\].key: no view depends on {key}: {message}"):
+        made()
+    made(ur.View(np.zeros((SIZE, SIZE, 3)), sensor=len(second)))
 
 
 def test_only_rays_that_hit_a_surface_have_a_vertex() -> None:

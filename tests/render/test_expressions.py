@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +226,27 @@ def box(size: float = 1.0) -> dict[str, Any]:
         "sky": {"type": "constant"},
         "lamp": {"type": "point", "position": [2, 3, 4], "intensity": 10.0},
     }
+
+
+@pytest.mark.parametrize("name", ["positions", "normals", "texcoords"])
+def test_one_number_fills_no_vertices(name: str) -> None:
+    """All vertices were at one point, and the run said only at its end that pictures do not determine them."""
+    key, paint = f"box.vertex_{name}", "box.bsdf.reflectance.value"
+    view, unknown = ur.View(np.zeros((16, 16, 3), np.float32)), ur.Parameter(key)
+    renderer = ur.Problem(box, [unknown], [view]).renderer
+    problem = partial(ur.Problem, renderer)
+    with pytest.raises(
+        ur.InputError, match=r"initial: expected a mesh file or an array of shape .*, got the number 0\.5"
+    ):
+        problem([ur.Parameter(key, initial=0.5)], [view])
+    with pytest.raises(ur.InputError, match="initial: expected different values, got 0 for all"):
+        problem([ur.Parameter(key, initial=np.zeros(renderer.parameters()[key].shape))], [view])
+    with pytest.raises(ur.InputError, match=f"truth.{key}: expected a mesh file"):
+        problem([unknown], [view], truth={key: 1.0})
+    with pytest.raises(ur.InputError, match=f"view 0: known: {key}: expected a mesh file"):
+        problem([ur.Parameter(paint)], [replace(view, known={key: 1.0})])
+    with pytest.raises(ur.InputError, match=f"expression of {key}: all of its .* numbers are 1 at the initial values"):
+        problem([ur.Parameter("size", initial=0.5)], [view], expressions={key: "2 * size"})
 
 
 @pytest.mark.slow

@@ -178,6 +178,10 @@ def test_normals_without_a_direction_are_refused_with_what_to_give() -> None:
     """Path gradients were 2e5 at 0.5, which stands for a vector of length 0."""
     key, views = "ball.bsdf.normalmap.data", [ur.View(np.zeros((16, 16, 3)))]
     with pytest.raises(ur.InputError, match=r"initial: 16 of 16 normals have no direction.*such as \[0.5, 0.5, 1\]"):
+        ur.Problem(built("normalmap"), [ur.Parameter(key, initial=[0.5, 0.5, 0.5])], views)
+    with pytest.raises(
+        ur.InputError, match=r"initial: expected a colour \(3 numbers\) or an array of shape \(4, 4, 3\), got the num"
+    ):
         ur.Problem(built("normalmap"), [ur.Parameter(key, initial=0.5)], views)
     ur.Problem(built("normalmap"), [ur.Parameter(key)], views)
     ur.Problem(built("normalmap"), [ur.Parameter(key, initial=[0.5, 0.5, 1.0])], views)

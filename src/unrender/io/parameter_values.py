@@ -41,12 +41,14 @@ class FileConversion:
         half: whether the renderer stores values in half precision.
         repeated: number of columns at each end of the second axis that repeat those of the opposite end; Mitsuba's environment maps have
             one. The parameter has the shape (H, W + 2 `repeated`, C), and its images have (H, W).
+        takes_number: whether one number can fill the values, as it cannot for positions, directions and texture coordinates.
         vertices: function that returns the parameter's values from a mesh file as a flat float32 array; None for other parameters.
     """
 
     raw: bool = False
     half: bool = False
     repeated: int = 0
+    takes_number: bool = True
     vertices: Callable[[Path], np.ndarray] | None = field(default=None, compare=False, repr=False)
 
     def picture_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -99,17 +101,20 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         ) from error
     if not np.isfinite(array).all():
         raise InputError("must be finite, got NaN or infinite values")
+    if array.size > 3 and not conversion.takes_number and not np.ptp(array):
+        raise InputError(f"expected different values, got {array.flat[0]:g} for all")
     if array.shape == shape:
         return periodic.repeat(array, conversion.repeated), ""
     if array.shape == conversion.picture_shape(shape):
         return periodic.pad(array, conversion.repeated), ""
     if _is_unflattened(array.shape, shape):
         return array.reshape(shape), ""
-    scalar = array.shape in ((), (1,))
+    scalar = array.shape in ((), (1,)) and (conversion.takes_number or not shape)
     colour = array.ndim == 1 and len(shape) > 1 and array.shape[0] == shape[-1]
     if scalar or colour:
         return np.array(np.broadcast_to(array.reshape(-1) if colour else array.reshape(()), shape)), ""
-    raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {array.shape}")
+    got = f"an array of shape {array.shape}" if array.size != 1 else f"the number {array.item():g}"
+    raise InputError(f"expected {_expected(shape, conversion)}, got {got}")
 
 
 def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -> tuple[np.ndarray, str]:
@@ -166,7 +171,8 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
 
 def _check_shape(array_shape: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
-    number, colour = array_shape in ((), (1,)), len(array_shape) == 1 and len(shape) > 1 and array_shape[0] == shape[-1]
+    number = array_shape in ((), (1,)) and conversion.takes_number
+    colour = len(array_shape) == 1 and len(shape) > 1 and array_shape[0] == shape[-1]
     same = array_shape in (shape, conversion.picture_shape(shape)) or _is_unflattened(array_shape, shape)
     if not (number or colour or same):
         raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {array_shape}")
@@ -183,10 +189,13 @@ def _is_unflattened(array_shape: tuple[int, ...], shape: tuple[int, ...]) -> boo
 def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str:
     if not shape:
         return "a number"
+    accepted = ["a number"] if conversion.takes_number else []
     if shape == (3,):
-        return "a number or 3 numbers"
-    colour = "a colour (3 numbers), " if len(shape) > 1 and shape[-1] == 3 else ""
-    return f"a number, {colour}or an array of shape {conversion.picture_shape(shape)}"
+        return " or ".join([*accepted, "3 numbers"])
+    accepted += ["a colour (3 numbers)"] if len(shape) > 1 and shape[-1] == 3 else []
+    accepted += ["a mesh file"] if conversion.vertices is not None else []
+    comma = "," if len(accepted) > 1 or conversion.takes_number else ""
+    return f"{', '.join(accepted)}{comma} or an array of shape {conversion.picture_shape(shape)}"
 
 
 def _short(value: Any) -> str:

@@ -164,6 +164,8 @@ class ExpressionRenderer(RendererWrapper):
             raise KeyedError(one.key, f"it cannot be evaluated at the initial values: {words}") from error
         if not np.isfinite(value).all():
             raise KeyedError(one.key, "it is not finite at the initial values")
+        if value.size > 1 and not info.conversion.takes_number and not np.ptp(value):
+            raise KeyedError(one.key, f"all of its {value.size} numbers are {value.flat[0]:g} at the initial values")
         if not arrays.all_within(value, info.lowest, info.highest):
             limits = " and ".join(checks.limits(info.lowest, info.highest))
             raise KeyedError(

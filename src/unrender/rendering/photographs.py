@@ -34,6 +34,15 @@ def scene_renderer(renderer: Renderer) -> Renderer:
     return unwrapped(renderer, (WithParameter, TiedRenderer, ExpressionRenderer, WorldsRenderer))
 
 
+def scene_members(renderer: Renderer, key: str) -> list[str]:
+    """Return the keys of the scene's parameters that an unknown sets: its own, those of its tie, or those of its expressions."""
+    keys = [key]
+    for layer in layers(renderer):
+        if isinstance(layer, (TiedRenderer, ExpressionRenderer)):
+            keys = layer.expanded(keys)
+    return keys
+
+
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values with each tie replaced by its members, and unknowns of expressions by the parameters that depend on them."""
     base = unwrapped(renderer, WithParameter)

@@ -53,6 +53,7 @@ class ParameterInfo:
         angle, axial: whether its values are angles in radians; whether they turn a light whose own axis no picture shows.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
         of_expression: whether expressions read it, which may be nonlinear.
+        shown: whether images can depend on it, as depths cannot on a colour.
     """
 
     shape: tuple[int, ...]
@@ -81,6 +82,7 @@ class ParameterInfo:
     lobe: bool = False
     of_expression: bool = False
     length: float = 1.0
+    shown: bool = True
 
     @property
     def curved(self) -> bool:

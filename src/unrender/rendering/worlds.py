@@ -28,7 +28,7 @@ from unrender.rendering.renderer import (
     drawing_emitters,
     with_differential_bsdf,
 )
-from unrender.rendering.wrapper import RendererWrapper
+from unrender.rendering.wrapper import RendererWrapper, layers, unwrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,15 @@ def with_worlds(renderer: Renderer, worlds: Sequence[World], bare: bool = True) 
             distinct.append(world)
     made = WorldsRenderer(renderer, distinct, bare)
     return made, made.sensors_of(worlds) or []
+
+
+def worlds_of(renderer: Renderer, sensors: Sequence[int]) -> list[World]:
+    """Return the scene's renderer, its sensor and the known values for each of these sensors of a renderer with wrappers."""
+    layer = next((one for one in layers(renderer) if isinstance(one, WorldsRenderer)), None)
+    if layer is not None:
+        return [replace(layer.state_of(sensor), sensor=int(layer._sensor[sensor])) for sensor in sensors]
+    scene = unwrapped(renderer, RendererWrapper)
+    return [World(scene, sensor, {}) for sensor in sensors]
 
 
 class WorldsRenderer(RendererWrapper):

@@ -137,12 +137,6 @@ def scene_keys(parameters: Sequence[Parameter]) -> list[str]:
     return [*keys, *(member for tie in ties_of(parameters) for member in tie.factors)]
 
 
-def members_of(parameters: Sequence[Parameter]) -> dict[str, list[str]]:
-    """Return the keys of the scene that each unknown sets: those of its tie, else its own. Raises `FieldError` as `ties_of`."""
-    own = {parameter.key: [parameter.key] for parameter in parameters if isinstance(parameter.key, str)}
-    return own | {tie.key: list(tie.factors) for tie in ties_of(parameters)}
-
-
 def tied(renderer: Renderer, parameters: Sequence[Parameter], ties: Sequence[Tie]) -> Renderer:
     """Return the renderer with the ties of these parameters. Raises `FieldError` for members that cannot share a value."""
     try:

@@ -26,7 +26,7 @@ from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.coordinates import Coordinates
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.meshes import check_surfaces
-from unrender.scene.parameter import Parameter, ParameterSettings, Unknown, members_of, scene_keys, tied, ties_of
+from unrender.scene.parameter import Parameter, ParameterSettings, Unknown, scene_keys, tied, ties_of
 from unrender.scene.references import References, ViewLosses, likelihood_scale
 from unrender.scene.surfaces import Surface
 from unrender.scene.validation import (
@@ -133,10 +133,10 @@ class Problem(ViewLosses):
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
         renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions)
-        if not partial:
-            check_determined(original_views, members_of(checked_parameters))
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
+        if not partial:
+            check_determined(original_views, located, renderer, list(unknowns))
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
         unknown_notices = [line for unknown in unknowns.values() for line in unknown.notices]
         vars(self).update(

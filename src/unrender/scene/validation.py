@@ -295,7 +295,10 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
 
 
 def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
-    """Raise `InputError` for a normal map with very short vectors: derivatives grow with the inverse of their length."""
+    """Raise `InputError` for a direction of length 0, or a normal map with very short vectors: derivatives grow with the inverse of their
+    length."""
+    if info.role == "direction" and start.shape == (3,) and not start.any():
+        raise InputError("expected a vector of any length above 0, got three zeros")
     if info.role != "normal":
         return
     short = np.linalg.norm(2.0 * start.reshape(-1, 3) - 1.0, axis=-1) < _SHORTEST_NORMAL

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,15 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, listed
 from unrender.io import parameter_values
 from unrender.io.toml_lines import FieldError
 from unrender.rendering.expressions import are_storable, expression_layer
-from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.photographs import scene_members, scene_renderer
 from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.turns import TurnsLights, turns_of, with_scene
-from unrender.rendering.worlds import World, with_worlds
+from unrender.rendering.worlds import World, with_worlds, worlds_of
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_sensor
 
@@ -106,12 +106,48 @@ def requested_depth(renderer: Renderer, views: Sequence[View], max_depth: int) -
     return getattr(scene_renderer(renderer), "requested_depth", max_depth) if own else max_depth
 
 
-def check_determined(views: Sequence[View], unknowns: Mapping[str, Collection[str]]) -> None:
-    """Raise `FieldError` if all views know all parameters of the scene that an unknown sets, {key: keys of the scene}."""
-    for key, members in unknowns.items():
-        if all(set(members) <= (view.known or {}).keys() for view in views):
+def check_determined(
+    views: Sequence[View], located: Sequence[View], renderer: Renderer, unknowns: Sequence[str]
+) -> None:
+    """Raise `FieldError` for an unknown on which no view depends.
+
+    Args:
+        views: Views as passed.
+        located: Views with the sensors of `renderer`, see `of_views`.
+        renderer: Renderer with all wrappers.
+        unknowns: Keys of the unknowns, in order.
+    """
+    states = worlds_of(renderer, [view.sensor for view in located])
+    for index, key in enumerate(unknowns):
+        members = scene_members(renderer, key)
+        if not all(member in scene_renderer(renderer).parameters() for member in members):
+            continue  # an unknown of photographs
+        pairs = list(zip(views, states, strict=True))
+        reasons = [[_unseen(member, view, state) for member in members] for view, state in pairs]
+        if not all(map(all, reasons)):
+            continue
+        if all(reason == _KNOWN for of_view in reasons for reason in of_view):
             what = f"{key} is known in all views, so none determines it; leave it out of one, or of the unknowns"
             raise FieldError(("views", 0, "with"), what, "view 0: known")
+        shown = dict.fromkeys(f"view {n} {of_view[0]}" for n, of_view in enumerate(reasons))
+        what = f"no view depends on {key}: {listed(list(shown))}; add a view that does, or leave it out of the unknowns"
+        raise FieldError(("parameters", index, "key"), what)
+
+
+_KNOWN = "knows it"
+
+
+def _unseen(member: str, view: View, world: World) -> str:
+    """Return the reason why a view does not depend on a parameter of the scene; "" if it may."""
+    known = world.renderer.parameters()
+    if member in (view.known or {}):
+        return _KNOWN
+    if member not in known:
+        return "has a scene without it"
+    if not known[member].shown:
+        return f"has the aov {view.aov}, which does not show it"
+    sensor = known[member].sensor
+    return "" if sensor in (None, world.sensor) else f"has sensor {world.sensor}, and it moves sensor {sensor}"
 
 
 def _equal(one: Any, other: Any) -> bool:

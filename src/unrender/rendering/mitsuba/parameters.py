@@ -94,17 +94,29 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
 
     A shared object affects the image through several chains of owners. The result combines the restrictions of all chains.
     """
-    leaf = key.rsplit(".", 1)[-1]
-    node = parameters.properties[key][2]
+    traits = [_traits_of(chain, key) for chain in _chains(parameters, key, graph)]
+    return functools.reduce(_combined, traits) if traits else ParameterTraits(False, "")
+
+
+def shows(aov: str, parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> bool:
+    """Return whether an AOV, one of `AOVS`, can depend on the parameter `key` of a traversed scene."""
+    if (leaf := key.rpartition(".")[2]) in _COMPUTED_OR_FIXED:
+        return aov == ("sh_normal" if leaf == NORMALS else "albedo")
+    hidden = (mi.Emitter, mi.Medium) if aov == "albedo" else (mi.Emitter, mi.Medium, mi.BSDF)
+    chains = _chains(parameters, key, graph)
+    return any(not any(isinstance(node, hidden) for node in chain) for chain in chains)
+
+
+def _chains(parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> list[list[Any]]:
+    """Return the chains of objects through which a parameter affects the image. Each begins with the object that reads it."""
+    leaf, node = key.rsplit(".", 1)[-1], parameters.properties[key][2]
     attribute = leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
     if isinstance(node, mi.Mesh) and attribute:
         readers = graph.attribute_readers(node, leaf)
-        chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
-        return functools.reduce(_combined, [_traits_of(chain, key) for chain in chains], ParameterTraits(False, ""))
+        return [chain for reader in readers for chain in graph.chains(reader) if node in chain]
     chains = list(graph.chains(node))
     # a texture that the scene itself holds has no effect there
-    effective = [chain for chain in chains if len(chain) > 2] or chains
-    return functools.reduce(_combined, [_traits_of(chain, key) for chain in effective])
+    return [chain for chain in chains if len(chain) > 2] or chains
 
 
 def _combined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:

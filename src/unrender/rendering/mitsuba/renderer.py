@@ -31,7 +31,7 @@ from unrender.rendering.mitsuba.geometry_terms import (
 )
 from unrender.rendering.mitsuba.light_paths import LightPaths, mask_notices, null_notices
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import tensor
+from unrender.rendering.mitsuba.parameters import shows, tensor
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.rigid_motions import lengths
@@ -244,7 +244,16 @@ class MitsubaRenderer:
             renderer._info = self._info | {
                 key: replace(x, differentiable=False, reason=reason) for key, x in moving.items()
             }
+            unseen = [key for key, x in renderer._info.items() if x.perturbable and not self._shows(name, key)]
+            renderer._info |= {key: replace(renderer._info[key], shown=False) for key in unseen}
         return self._aovs[name]
+
+    def _shows(self, aov: str, key: str) -> bool:
+        """Return whether an AOV can depend on a parameter."""
+        if key in self._poses:  # emitters without a shape are not seen
+            shapeless = {emitter.id() for emitter in self.pair.current.emitters() if emitter.get_shape() is None}
+            return self._poses[key].target not in shapeless
+        return key in self._turned or shows(aov, self.pair.current_parameters, key, self.pair.loaded().graph)
 
     def stock(self) -> StockSession:
         if self.pair.replaced:

@@ -328,9 +328,12 @@ class ScenePair:
     def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
         """Return `info` with the role, brightness, linearity and file conversion of the parameter."""
         known, limits, described = self.current_parameters, self.physical_range(key), self.description
-        form, conversion = is_nonlinear(known, key, info.singular), scene_loading.conversion(known, key, described)
+        form, meaning = is_nonlinear(known, key, info.singular), role(known, key, info.shape)
+        conversion = scene_loading.conversion(known, key, described)
+        if meaning in ("normal", "direction") or info.welded or key.endswith(f".{mesh_layout.TEXCOORDS}"):
+            conversion = replace(conversion, takes_number=False)
         info = replace(info, nonlinear=form, lobe=limits.lobe, scattering=limits.scattering, conversion=conversion)
-        return replace(info, role=role(known, key, info.shape), brightness=brightness(known, key))
+        return replace(info, role=meaning, brightness=brightness(known, key))
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)
