@@ -53,9 +53,8 @@ def _spp(task: Task, c: Config) -> int:
 
 def _smoothed(task: Task, c: Config, samples: int, **more: Any) -> ur.SmoothedDerivatives:
     schedule = _shrinking(c["half_life"], FLOOR)
-    return ur.SmoothedDerivatives(
-        task.widths, samples, spp=_spp(task, c), schedule=schedule, **{"joint": False, **more}
-    )
+    more = {"joint": False, **more} if "order" in more else more
+    return ur.SmoothedDerivatives(task.widths, samples, spp=_spp(task, c), schedule=schedule, **more)
 
 
 def _adam(task: Task, c: Config) -> Any:
