@@ -122,3 +122,19 @@ def test_derivative_images_that_are_noise_leave_path_gradients(
     assert losses(found) == losses(first)
     np.testing.assert_array_equal(found.parameters["gain"], first.parameters["gain"])
     assert found.history[-1]["samples"] > first.history[-1]["samples"], "a trial traces paths"
+
+
+@pytest.mark.parametrize("case", ["bound", "unseen"])
+def test_numbers_at_a_bound_or_without_influence_do_not_delay_the_change(case: str) -> None:
+    """The gradient at a bound always has one sign, so gradients seemed to agree; and an unseen number has no positive curvature."""
+    truth = {"gain": TRUTH["gain"], "other": np.array([0.9], np.float32)}
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 4))
+    matrix[:, 3] *= case == "bound"
+    renderer = AnalyticRenderer(truth, matrix, 0.1, 2.0, shape=SHAPE)
+    unknowns = [ur.Parameter("gain", 0.2, bounds=(0.0, 1.0)), ur.Parameter("other", 0.5, bounds=(0.0, 0.8))]
+    made = ur.Problem(renderer, unknowns, [ur.View(renderer.exact(truth))], truth=truth)
+    both = plan(made)
+    change = Change()
+    found = ur.optimize(made, both, steps=32, callbacks=[change], progress=False)
+    assert change.at is not None
+    assert found.parameters["other"] == pytest.approx(0.8 if case == "bound" else 0.5, abs=1e-4)

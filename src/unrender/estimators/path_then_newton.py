@@ -72,7 +72,8 @@ class PathThenNewton:
     better average. Derivative images are tried as soon as the mean correlation of successive gradients falls below one half and the steps
     so far took at least the time of that trial. If curvatures are positive, and noise adds less than twice as much to them, the trial is
     the first Gauss-Newton step. Otherwise the next trial follows after twice as many steps, or after as many times the steps as noise
-    exceeds the curvature, at most 16. The first differences are as wide as the parameters have moved so far.
+    exceeds the curvature, at most 16. The first differences are as wide as the parameters have moved so far. Elements at a bound beyond
+    which the loss falls, and elements that change no image, do not count.
 
     A Gauss-Newton step is a `BlockEstimate` of all parameters. An optimizer such as `Successive` therefore takes both kinds of steps.
 
@@ -114,7 +115,7 @@ class PathThenNewton:
             begun = state.newton if state.newton.widths else self._begun(problem, parameters, state)
             estimate, newton = self.newton.estimate(problem, parameters, begun, own)
             state = replace(state, newton=newton)
-            noise = 0.0 if state.changed else _noise(estimate)
+            noise = 0.0 if state.changed else _noise(estimate, _free(problem, parameters, trees.ravel(estimate.gradient)))
             if noise < _CLEAR:
                 if not state.changed:  # control variates of earlier parameters are no pictures of the end
                     state = replace(state, path=self.path.init(problem, parameters), changed=True)
@@ -128,7 +129,8 @@ class PathThenNewton:
             capabilities=(*estimate.capabilities, BlockEstimate((), None)),
             info={**estimate.info, "samples": int(estimate.info["samples"]) + tried},
         )
-        return estimate, replace(_observed(state, trees.ravel(estimate.gradient)), path=path)
+        gradient = trees.ravel(estimate.gradient)
+        return estimate, replace(_observed(state, gradient, _free(problem, parameters, gradient)), path=path)
 
     def _is_due(self, problem: Problem, state: PathThenNewtonState) -> bool:
         """Return whether derivative images are to be tried."""
@@ -148,25 +150,36 @@ class PathThenNewton:
         return replace(state.newton, widths=widths, shift=self.newton.coarse or self.newton.shift, point=point.theta)
 
 
-def _noise(estimate: Estimate) -> float:
-    """Return the mean ratio of what noise adds to a curvature to the curvature; infinite unless all curvatures are positive."""
+def _free(problem: Problem, parameters: Tree, gradient: np.ndarray) -> np.ndarray:
+    """Return which elements are not at a bound beyond which the loss falls, (n,)."""
+    sides = trees.ravel({key: problem.unknowns[key].sides(x) for key, x in parameters.items()})
+    return sides * gradient >= 0.0
+
+
+def _noise(estimate: Estimate, free: np.ndarray) -> float:
+    """Return the mean ratio of what noise adds to a curvature to the curvature; infinite unless all curvatures are positive.
+
+    Only `free` elements count that change the images: no step moves the others.
+    """
     hessian, noise = (
         arrays.numpy(estimate.require("PathThenNewton", kind).matrix).astype(np.float64)
         for kind in (Hessian, HessianNoise)
     )
-    if not (np.isfinite(hessian).all() and np.isfinite(noise).all()):
+    used = np.flatnonzero(free & (np.diag(hessian) != 0.0))
+    hessian, noise = (x[np.ix_(used, used)] for x in (hessian, noise))
+    if not used.size or not (np.isfinite(hessian).all() and np.isfinite(noise).all()):
         return math.inf
     scales, curvatures, directions = scaled_eigh(hessian)
     added = np.einsum("ki,kl,li->i", directions, noise / scales, directions)
     return float((added / curvatures).mean()) if (curvatures > 0.0).all() else math.inf
 
 
-def _observed(state: PathThenNewtonState, gradient: np.ndarray) -> PathThenNewtonState:
-    """Return the state after a path gradient (n,)."""
+def _observed(state: PathThenNewtonState, gradient: np.ndarray, free: np.ndarray) -> PathThenNewtonState:
+    """Return the state after a path gradient (n,), whose `free` elements (n,) count in the agreement."""
     agreement, square = state.agreement, np.square(gradient)
     if state.step:
         square = _MEMORY * state.square + (1.0 - _MEMORY) * square
-        units = np.where(square > 0.0, np.sqrt(square), 1.0)
+        units = np.where(free & (square > 0.0), np.sqrt(square), np.inf)
         one, other = gradient / units, state.last / units
         lengths = math.sqrt(float(one @ one) * float(other @ other))
         agreement = _MEMORY * agreement + (1.0 - _MEMORY) * (float(one @ other) / lengths if lengths > 0.0 else 0.0)
