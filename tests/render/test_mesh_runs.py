@@ -145,8 +145,10 @@ class Steps(Callback):
 
 
 @pytest.mark.usefixtures("short_ends")
-def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
-    """Problem files have none, so the run folder tells it."""
+def test_a_resumed_run_knows_the_true_surface_and_when_the_mesh_was_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Problem files have no surface, so the run folder tells it. A mesh that pictures no longer show has its line also then."""
     film = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
     text = f'<sensor type="perspective">{film}</sensor><emitter type="constant"/><shape type="cube" id="box"/>'
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
@@ -162,3 +164,23 @@ def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
     after = reader.read(tmp_path / "run")
     assert after.error_before == before == {key: pytest.approx(made.parameter_error(made.initial())[key], rel=1e-5)}
     assert after.error_after.keys() == {key}
+    steps_that_show_it(monkeypatch, 2)
+    whole = ur.optimize(made, *parts, steps=4, run_directory=tmp_path / "whole")
+    for steps in (2, 3):  # a step before the mesh is hidden, and one after
+        ur.optimize(made, *parts, steps=steps, run_directory=tmp_path / str(steps))
+        again = ur.resume(tmp_path / str(steps), steps=4)
+        assert again.warnings == whole.warnings
+        np.testing.assert_array_equal(again.parameters[key], whole.parameters[key])
+    assert any("the mesh has left the pictures" in line for line in whole.warnings)
+
+
+def steps_that_show_it(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Let the gradient of smoothed derivatives be 1, and zero after some steps."""
+    estimate = ur.SmoothedDerivatives.estimate
+
+    def hidden(self: Any, problem: Any, parameters: Any, state: Any, key: Any) -> Any:
+        found, after = estimate(self, problem, parameters, state, key)
+        shown = float(key.step < count)
+        return replace(found, gradient={k: 0.0 * x + shown for k, x in found.gradient.items()}), after
+
+    monkeypatch.setattr(ur.SmoothedDerivatives, "estimate", hidden)

@@ -292,7 +292,13 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     problem = of_mesh(key, POINTS, FACES, "ignore")
     crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
     run = SimpleNamespace(
-        problem=problem, step=3, estimator=None, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)}
+        problem=problem,
+        step=3,
+        estimator=None,
+        warnings=[],
+        stopped="steps",
+        parameters={key: crumpled.reshape(-1)},
+        state=SimpleNamespace(hidden={}),
     )
     descent, watch = run, MeshWatch()
     for size in (0.0, 1.0, 0.0, 0.0):
@@ -320,6 +326,7 @@ def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
     vertices, faces = np.concatenate([POINTS, POINTS]), np.concatenate([FACES, FACES + len(POINTS)])
     problem = of_mesh(key, vertices + away, faces, "ignore")
     run = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], step=25, stopped="")
+    run.state = SimpleNamespace(hidden={})
     watch, estimate = MeshWatch(), Estimate(0.0, {key: np.ones(vertices.size)})
     watch.on_update(run, estimate, True)  # type: ignore
     assert run.warnings == []
@@ -415,7 +422,7 @@ def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step(
         problem=problem,
         parameters={key: POINTS.reshape(-1)},
         warnings=[],
-        state=SimpleNamespace(zero_gradient={key: True}),
+        state=SimpleNamespace(zero_gradient={key: True}, hidden={}),
         estimator=ur.PathGradient(pixels=Views(1)),
     )
     mesh, influence = MeshWatch(), InfluenceWatch()

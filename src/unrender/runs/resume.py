@@ -40,8 +40,8 @@ from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
 _WARNINGS = "warnings"
-_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES = "candidate", "ahead", "numbers", "pictures"
-_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, "few_steps", "other_start")
+_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, _HIDDEN = "candidate", "ahead", "numbers", "pictures", "hidden"
+_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, _HIDDEN, "few_steps", "other_start")
 """Parts of a snapshot that only some runs have."""
 
 
@@ -271,6 +271,9 @@ def _unpack(
         _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
     if _NUMBERS in saved:
         NumberTrace.check(saved[_NUMBERS], f"{where}: {_NUMBERS}")
+    hidden = saved.get(_HIDDEN, {})
+    if not isinstance(hidden, dict) or not all(key in full_shapes and type(n) is int for key, n in hidden.items()):
+        raise InputError(f"{where}: {_HIDDEN}: expected a number of steps for meshes, got {repr(hidden)[:60]}")
     if _PICTURES in saved:
         check_stored(saved[_PICTURES], f"{where}: {_PICTURES}")
     return saved

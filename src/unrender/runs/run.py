@@ -165,7 +165,11 @@ class Run:
         candidate = None if state.candidate is None else vars(state.candidate)
         parts = {"candidate": candidate, "ahead": self.ahead or None}
         parts |= {"few_steps": self.few_steps or None, "other_start": state.other_start or None}
-        parts |= {"numbers": state.numbers.snapshot(), "pictures": state.pictures or None}
+        parts |= {
+            "numbers": state.numbers.snapshot(),
+            "pictures": state.pictures or None,
+            "hidden": dict(state.hidden) or None,
+        }
         return {
             "parameters": self.parameters,
             "step": self.step,
@@ -194,6 +198,7 @@ class Run:
         state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
         state.numbers = NumberTrace.restored(saved.get("numbers"))
         state.other_start, state.pictures = str(saved.get("other_start") or ""), saved.get("pictures", {})
+        state.hidden = dict(saved.get("hidden", {}))
 
 
 @dataclass(frozen=True)
@@ -224,6 +229,7 @@ class RunState:
         numbers: values of the numbers at each step.
         other_start: outcome of the comparison with other starts, see `runs.refinement`; "" before it.
         pictures: new images of earlier steps, see `earlier_image.stored`; {} before the first.
+        hidden: {mesh: number of steps since a picture showed it}, of the meshes that one has shown.
     """
 
     estimator: Any
@@ -237,6 +243,7 @@ class RunState:
     numbers: NumberTrace = field(default_factory=NumberTrace)
     other_start: str = ""
     pictures: dict[str, Any] = field(default_factory=dict)
+    hidden: dict[str, int] = field(default_factory=dict)
 
 
 SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")

@@ -98,19 +98,17 @@ _EVERY, _TRIANGLES = 25, 100
 class MeshWatch(Callback):
     """Callback that warns of meshes that no image shows any more, and of new self-intersections and folds."""
 
-    def __init__(self) -> None:
-        self._hidden: dict[str, int] = {}  # steps since a picture showed the mesh
-
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
+        hidden = run.state.hidden
         for key, faces in run.problem.faces.items() if applied else ():
             # None for estimators of losses only, or of directions instead of gradients.
             gradient = estimate.gradient.get(key)
             shown = gradient is not None and arrays.number(memory.square(gradient)) > 0.0
             if shown:
-                self._hidden[key] = 0
-            elif gradient is not None and key in self._hidden:
-                self._hidden[key] += 1
-                if self._hidden[key] == _draws(run):
+                hidden[key] = 0
+            elif gradient is not None and key in hidden:
+                hidden[key] += 1
+                if hidden[key] == _draws(run):
                     run.warnings.append(
                         f"step {run.step}: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"
                     )
