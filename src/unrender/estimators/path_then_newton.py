@@ -115,7 +115,9 @@ class PathThenNewton:
             begun = state.newton if state.newton.widths else self._begun(problem, parameters, state)
             estimate, newton = self.newton.estimate(problem, parameters, begun, own)
             state = replace(state, newton=newton)
-            noise = 0.0 if state.changed else _noise(estimate, _free(problem, parameters, trees.ravel(estimate.gradient)))
+            noise = (
+                0.0 if state.changed else _noise(estimate, _free(problem, parameters, trees.ravel(estimate.gradient)))
+            )
             if noise < _CLEAR:
                 if not state.changed:  # control variates of earlier parameters are no pictures of the end
                     state = replace(state, path=self.path.init(problem, parameters), changed=True)
