@@ -34,6 +34,9 @@ class Kept(ur.protocols.Callback):
         self._recorder = Recorder(seconds, points, steps, timer=work_time)
         self.returned: dict[str, np.ndarray] = {}
 
+    def on_start(self, run: Any) -> None:
+        self._recorder.begin()
+
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         try:
             self._recorder.step(run.full)
@@ -47,7 +50,7 @@ class Kept(ur.protocols.Callback):
 
     @property
     def seconds(self) -> float:
-        """Processor seconds so far, without the first step."""
+        """Processor seconds of the steps so far."""
         return self._recorder.clock
 
     @property

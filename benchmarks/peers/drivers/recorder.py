@@ -44,6 +44,10 @@ class Recorder:
         self._since: float | None = None
         self._timer, self._warm = timer, warm
 
+    def begin(self) -> None:
+        """Before the first step, if it is counted: nothing compiles in it."""
+        self._since = self._timer()
+
     def step(self, values: Callable[[], dict[str, np.ndarray]]) -> None:
         """After each step: `values` makes {key: array}, which is no part of the time."""
         now = self._timer()

@@ -3,7 +3,7 @@
 Lamps, a lens, a field of view, indices of refraction, roughness, a principled BSDF, fog, a sky and poses of lights, each from one picture
 of at most 32² pixels with 4,096 samples per pixel. Errors are means over the unknowns, relative to the start, of the returned values. The
 loop is tuned on a seed of its own over samples per pixel, rates and whether these fall, where `prb` has derivatives. Seconds are the
-processor's, without planning and the first step.
+processor's, without planning and the two steps that compile, of both.
 """
 
 from __future__ import annotations
