@@ -233,12 +233,13 @@ def as_few_samples(
     around = np.concatenate([np.ravel(9.0 * uniform_filter(image, 3) - image) for image in images])
     used = np.flatnonzero(weights)
     quiet = used[np.argsort(around[used])[: len(used) // 2]]
-    shared, deviation = float(products[quiet].sum()), math.sqrt(float(np.square(products[quiet]).sum()))
+    shared, parts = float(products[quiet].sum()), (products[quiet], products[used])
+    clear = all(float(x.sum()) > _SHARED * math.sqrt(float(x @ x)) for x in parts)
     error = math.sqrt(max(float(products.sum()), 0.0) / max(3.0 * float(weights.sum()), 1e-300))
     size = math.sqrt(paired_losses.mean_square(references, weights))
     count = float(variances[quiet].sum()) / max(shared, 1e-300)
     large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * size
-    if not (large and shared > _SHARED * deviation and count < _SAMPLES):
+    if not (large and clear and count < _SAMPLES):
         return None
     explanation = (
         f", as the noise of references with {count:.2g} samples per pixel would: if they have several times as many, the run "
