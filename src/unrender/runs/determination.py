@@ -86,15 +86,16 @@ def undetermined(
     Args:
         values: {key: array}, values of the other parameters.
         spp: samples per pixel of each of four renderings per view.
-        seconds: time after which no further parameter is tested; the first one always is.
+        seconds: time after which no further parameter is tested; the first one always is, unless renderings are counted.
         per_pass: see `render`.
         most: time limit for parameters whose sensitivity is 0, if it is longer than `seconds`.
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
         errors: {key: array}, standard errors of the values.
     """
-    known, lines, longest, began = problem.renderer.parameters(), [], 0.0, timing.now()
+    known, lines, began = problem.renderer.parameters(), [], timing.now()
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
     until = {True: began + max(seconds, most), False: began + seconds}
+    spp, longest = _counted(problem, spp, seconds, per_pass or spp) if timing.counts() else (spp, 0.0)
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
         info, (low, high) = known[key], problem.unknowns[key].bounds
         own, initial = np.asarray(values[key], np.float32), problem.unknowns[key].initial
@@ -107,9 +108,8 @@ def undetermined(
         started = timing.now()
         if longest > 0.0 and started + longest > until[key in unseen]:
             break
-        ends = [own, initial]
-        if ranged:
-            ends = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)]
+        limits = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)] if ranged else []
+        ends = limits or [own, initial]
         details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
         first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:
@@ -124,6 +124,14 @@ def undetermined(
         if line := _words(hidden, change, ranged, bounded):
             lines.append(f"{key}: {line}")
     return lines
+
+
+def _counted(problem: Problem, spp: int, seconds: float, least: int) -> tuple[int, float]:
+    """Return the samples per pixel for which there is time, from `least` to `spp`, and the time of one change of the images with these, if
+    renderings are counted."""
+    paths = _RENDERINGS / 2 * sum(math.prod(problem.sizes[view]) for view in selected_views(problem))
+    spp = max(min(spp, power_of_two(int(seconds / timing.cost(paths)))), min(least, spp))
+    return spp, timing.cost(spp * paths)
 
 
 def _moved(initial: np.ndarray, values: np.ndarray) -> bool:

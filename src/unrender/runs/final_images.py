@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
-from unrender.runs.budget import MOST_SLOWDOWN, seconds_of_steps, slowdown
+from unrender.runs.budget import MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
 from unrender.runs.determination import (
     common_factor,
     undetermined,
@@ -50,6 +50,9 @@ _SENSITIVITY_SHARE = 0.5
 """Additional time limit of the sensitivity relative to that; it takes at least one probe."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 """Time limit of each of two tests of undetermined parameters relative to the time of the steps, and its minimum in seconds."""
+_LEAST_COUNTED = (
+    0.1  # time limit of each test of undetermined parameters if renderings are counted, even if no time is left
+)
 _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE, _NUMBERS_COUNTED = 0.05, 2.0
@@ -98,15 +101,18 @@ class FinalImages:
     rise: str = ""
 
 
-def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True) -> None:
-    """Compile the kernels of `render_final_images` with an image of one pass per view and, if `tested`, one pass of each test."""
+def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True, counted: float = math.inf) -> None:
+    """Compile the kernels of `render_final_images` with an image of one pass per view and, if `tested`, one pass of each test.
+
+    `counted` is the time for final pictures and tests if renderings are counted; otherwise infinite.
+    """
     pass_spp, count = _pass_spp(problem), len(problem.views)
     own = count if count < MANY_SENSORS else 1  # more of them share their kernels
     for view in range(own):
         render(problem, values, view, pass_spp, per_pass=pass_spp)
     if tested and len(_chosen(problem)) == count:
         curvature(problem, values, probes=1, views=own)
-        compile_check(problem, values)
+        compile_check(problem, values, counted)
 
 
 def render_final_images(
@@ -138,7 +144,7 @@ def render_final_images(
         spent, ends = timing.now() - began, halves_of["result"]
         if risen := rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=risen)
-        tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
+        tests = max(left(), 0.0 if timing.counts() else _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
@@ -156,7 +162,7 @@ def render_final_images(
             lines = [*untested_factor(problem), *untested_changes(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
-                problem, result, sensitivities, 0.25 * tests, weights, fits=fits, complete=complete
+                problem, result, sensitivities, left, tests, weights, fits=fits, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
@@ -230,7 +236,8 @@ def _undetermined(
     problem: Problem,
     result: Result,
     sensitivities: Mapping[str, np.ndarray],
-    most: float,
+    left: Callable[[], float],
+    tests: float,
     weights: Sequence[np.ndarray],
     fits: bool,
     complete: bool,
@@ -238,25 +245,35 @@ def _undetermined(
     """Return lines about what the images do not determine and about numbers that have not settled, standard errors, and keys of
     undetermined numbers; none without steps.
 
-    Each test takes at most about `most` seconds. A final picture that does not fit the references (`fits`) has no standard errors.
-    `complete`: see `render_final_images`.
+    A final picture that does not fit the references (`fits`) has no standard errors. `complete`: see `render_final_images`.
+
+    Of `tests` seconds, a test takes at most about a quarter, unless renderings are counted: tests then take what is `left`, the most
+    telling ones first.
     """
     if not result.steps:
         return [], (), {}, []
     lines = undetermined_cells(sensitivities)
+    most = tests if timing.counts() else 0.25 * tests
+
+    def within(seconds: float) -> float:
+        return min(seconds, max(left(), _LEAST_COUNTED)) if timing.counts() else seconds
+
     seconds = min(max(_LOOK_SHARE * seconds_of_steps(result), _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
     per_pass = _pass_spp(problem)
-    lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
+    lines += common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
-    of_numbers = max(allowed, _NUMBERS_COUNTED) if timing.counts() else allowed
+    of_numbers = allowed
+    if timing.counts():
+        of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_end(result.history[-1]["samples"], result.steps))
     numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights)
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
-    lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
+    limits = within(seconds), per_pass, within(most), sensitivities, deviations
+    lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
-    lines += hidden_changes(problem, result.parameters, per_pass, 2.0 * allowed, per_pass)
+    lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])
@@ -356,9 +373,8 @@ def _first_half(problem: Problem, spp: int, values: Mapping[str, np.ndarray], vi
 def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
     """Return the affordable samples per pixel of final images, from the measured time of a few samples of the first view."""
     sizes = [height * width for height, width in problem.sizes]
-    most, trial = _most_spp(problem), _pass_spp(problem)
-    seconds = 0.0
-    for seed in (0, 1):  # the first rendering compiles kernels
+    most, trial, seconds = _most_spp(problem), _pass_spp(problem), timing.cost(_pass_spp(problem) * sizes[0])
+    for seed in () if timing.counts() else (0, 1):  # the first rendering compiles kernels
         started = timing.now()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = timing.now() - started

@@ -90,10 +90,11 @@ def check_numbers(
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
         return NumbersCheck()
-    numbers = replace(numbers, weights=weights)
-    until = timing.now() + seconds
+    if (affordable := numbers.affordable(_PASSES + 1, seconds if timing.counts() else math.inf)) is None:
+        return NumbersCheck(unchecked=numbers.keys)
+    numbers = replace(affordable, weights=weights)
     try:
-        return _of_tested_views(_check(numbers, sensitivities, until), numbers, sensitivities)
+        return _of_tested_views(_check(numbers, sensitivities, timing.now() + seconds), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
         return NumbersCheck()
 
@@ -121,9 +122,10 @@ def checked_keys(
 
 
 @exclusive("compile_check")
-def compile_check(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
-    """Compile the kernels of `check_numbers`."""
-    if (numbers := Numbers.of(problem, values, values)) is not None:
+def compile_check(problem: Problem, values: Mapping[str, np.ndarray], seconds: float) -> None:
+    """Compile the kernels of `check_numbers` if it has time, and `seconds` if renderings are counted."""
+    numbers = Numbers.of(problem, values, values)
+    if numbers is not None and (numbers := numbers.affordable(_PASSES + 1, seconds)) is not None:
         with contextlib.suppress(InputError):  # a value that the renderer rejects
             for count in (1, 2 * numbers.point.size):
                 numbers.pictures(np.tile(numbers.point, (count, 1)), Key(0, 0, _STREAM))
@@ -152,8 +154,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
     moved, fixed = fields_of(numbers, sensitivities)
     if moved:
-        now = timing.now()
-        half = now + 0.5 * (until - now) if math.isfinite(until) else until
+        half = 0.5 * (timing.now() + until)
         extended = add_field_directions(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
         if extended is None:
             return NumbersCheck(unchecked=numbers.keys)

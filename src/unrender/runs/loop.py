@@ -31,6 +31,7 @@ from unrender.runs.run import GradientNoise, Run, RunState, interruptible
 from unrender.runs.watches import remarks
 from unrender.scene.surfaces import guarded
 
+WARM_UP_STEPS = 2  # number of discarded steps before the first one
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0
 """Ratio of the pause before the next measurement of the parameters' error to the measurement's duration."""
@@ -106,14 +107,15 @@ def descend(run: Run) -> Result:
 
 
 def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
-    """Compile every kernel of a step by two steps whose results are discarded. Return the elapsed seconds, and the snapshot after these."""
+    """Compile every kernel of a step by steps whose results are discarded. Return the elapsed seconds, and the snapshot after them."""
     started = time.perf_counter()
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
     state = run.state
-    for _ in range(2):
+    for _ in range(WARM_UP_STEPS):
         estimate, state.estimator = run.estimator.estimate(
             run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
         )
+        state.samples += int(estimate.info.get("samples", 0))
         estimate = penalized(estimate, run.problem, run.parameters)
         memory.trim_cache(run.parameters)
         update = _apply(run, estimate, {})

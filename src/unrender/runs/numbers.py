@@ -12,7 +12,7 @@ from unrender.core import arrays, timing
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.rendering.renderer import RenderSession, SampleRequest
-from unrender.runs.image_sensitivity import mask_roots
+from unrender.runs.image_sensitivity import ADJOINT, adjoint_spp, mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, selected_views
 from unrender.statistics.paired_losses import slices_of_images
@@ -21,8 +21,8 @@ MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers up to which they are tested; elements of a number or colour; longer lists are left out first."""
 _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
-_PATHS, _SPP = 1 << 18, (4, 32)
-"""Path budget of the pictures of one pass, and limits of their samples per pixel."""
+_PATHS, _LEAST_PATHS, _SPP = 1 << 18, 1 << 11, (4, 32)
+"""Path budget of the pictures of one pass, least paths of one picture in a short run, and limits of their samples per pixel."""
 TOO_SHORT = "the run is too short for this test; use more steps or seconds, or fewer pixels"
 """Reason of a test that takes more than its share of the run's time."""
 
@@ -157,6 +157,25 @@ class Numbers:
     def count(self) -> int:
         """Number of elements of the numbers, n."""
         return len(self.sizes)
+
+    def affordable(self, passes: int, seconds: float) -> Numbers | None:
+        """Return numbers with as many samples, up to their own, as counted renderings allow for a check; None if there is no time for one.
+
+        Args:
+            passes: number of differences along each number before the last ones, which are along all directions.
+            seconds: time limit on the clock of `timing`.
+        """
+        n, others = self.count, len(self.problem.unknowns) - len(self.keys)
+        k = n + 1 + others if others else 0  # first directions of textures and grids
+        launches = len(self.views) * (2 * passes + 4 + 2 * (n + k) + 4 * (k > 0))
+        pixels = sum(math.prod(self.problem.sizes[view]) for view in self.views)
+        adjoints = (1 + ADJOINT * (n + 1)) * adjoint_spp(self.problem) * self.problem.pixels if k else 0
+        spp = self.spp
+        while timing.cost(spp * pixels * (4 * n * passes + 8 * k + 6 * (n + k) + 2) + adjoints, launches) > seconds:
+            spp //= 2
+            if spp < 2 or spp * pixels < _LEAST_PATHS:
+                return None
+        return replace(self, spp=spp)
 
     def alone(self) -> Numbers:
         """Return the numbers without directions of other unknowns."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import shutil
 import time
@@ -23,6 +24,7 @@ from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
+from unrender.runs.budget import cost_of_end
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_checks import with_misfit
 from unrender.runs.final_images import at_start, render_final_images, warm_up
@@ -51,6 +53,7 @@ from unrender.runs.folder.schema import (
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
+from unrender.runs.loop import WARM_UP_STEPS
 from unrender.runs.result import TERMINATED, Result
 from unrender.runs.truth_check import has_few_steps, with_few_steps
 from unrender.runs.verification import fit_status
@@ -161,7 +164,9 @@ class RunWriter(Callback):
             share = _TESTED_SHARE[run.compiled]
             self._tested = run.seconds is None or run.time_left() > share * run.seconds
             with phases.phase(callbacks.COMPILING):
-                warm_up(run.problem, run.full(), self._tested)
+                steps = run.steps or 0
+                counted = math.inf if run.seconds else cost_of_end(steps * warm["samples"] / WARM_UP_STEPS, steps)
+                warm_up(run.problem, run.full(), self._tested, counted)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         self.append(record)
@@ -182,7 +187,12 @@ class RunWriter(Callback):
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
             complete = isinstance(run.optimizer, Measuring)
-            given = self.final_spp, run.time_left, self._tested, result.pixel_weights, complete
+            allowed = cost_of_end(run.state.samples, run.step)
+
+            def left() -> float:
+                return run.time_left() if run.seconds is not None else allowed - timing.now()
+
+            given = self.final_spp, left, self._tested, result.pixel_weights, complete
             with timing.counting(run.seconds is None):
                 images = render_final_images(run.problem, result, *given)
                 if images.rise:
