@@ -10,7 +10,7 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from unrender.core.errors import VariantError
 HERE = Path(__file__).resolve().parent
 KERNELS = "DRJIT_CACHE_DIR"
 """Where Dr.Jit keeps compiled kernels on disk; it reads this once, when it is imported."""
+
+SCENES = [0]
+"""Number of scenes that this process has loaded."""
 
 # Every process of the run shares one folder, the commands that tests start too. `make clean` empties it.
 os.environ.setdefault(KERNELS, str(HERE.parent / ".pytest_cache" / "kernels"))
@@ -40,6 +43,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason=cpu.args[0]))
         if item.get_closest_marker("mitsuba") and isinstance(item, pytest.Function):
             item.fixturenames.insert(0, "mitsuba_variant")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Free the scenes of a test that refer to themselves, as `no_scene_outlives_its_file` does: else chance and speed decide which live on,
+    and a second run of the tests compiles other kernels. After the teardown, since pytest holds values of fixtures until then."""
+    before, start = SCENES[0], time.process_time()
+    result = yield
+    if SCENES[0] != before or ("mitsuba" in sys.modules and time.process_time() - start > 0.5):
+        gc.collect()
+    return result
 
 
 def pytest_collection_finish() -> None:
@@ -61,8 +75,21 @@ def mitsuba_variant() -> str:
     if workers > 1:
         # Each worker would start a thread per core, and they would wait for each other. With one thread Mitsuba's EXR writer hangs.
         dr.set_thread_count(max(2, dr.thread_count() // workers))
+    count_scenes()
     gc.freeze()  # Mitsuba's module, and no scene yet
     return name
+
+
+def count_scenes() -> None:
+    from unrender.rendering.mitsuba.description import Parsed
+
+    instantiate = Parsed.instantiate
+
+    def counted(parsed: Parsed) -> Any:
+        SCENES[0] += 1
+        return instantiate(parsed)
+
+    Parsed.instantiate = counted
 
 
 @pytest.fixture(scope="module")
@@ -139,12 +166,3 @@ def threads_as_before() -> Iterator[None]:
         if dr.thread_count() != before:
             dr.sync_thread()
             dr.set_thread_count(before)
-
-
-@pytest.fixture(autouse=True)
-def no_scene_outlives_a_long_test(no_scene_outlives_its_file: None) -> Iterator[None]:
-    """See `no_scene_outlives_its_file`: of scenes that refer to themselves. Processor time, since a busy machine makes every test long."""
-    start = time.process_time()
-    yield
-    if "mitsuba" in sys.modules and time.process_time() - start > 0.5:
-        gc.collect()

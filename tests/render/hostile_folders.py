@@ -53,8 +53,14 @@ def _page(folder: Path) -> Any:
     return report.page(folder)
 
 
-def _put(name: str, data: str | bytes) -> Callable[[Path], Any]:
-    return lambda folder: (folder / name).write_bytes(data.encode() if isinstance(data, str) else data)
+def _put(name: str, data: str | bytes | Callable[[], str | bytes]) -> Callable[[Path], Any]:
+    """Write a file; large contents are made by a function when a test needs them."""
+
+    def spoil(folder: Path) -> None:
+        made = data() if callable(data) else data
+        (folder / name).write_bytes(made.encode() if isinstance(made, str) else made)
+
+    return spoil
 
 
 def _pipe(name: str) -> Callable[[Path], Any]:
@@ -91,9 +97,12 @@ def _many() -> dict[str, int]:
     return {f"{number:x}": 1 for number in range(_MANY)}
 
 
+def _twice() -> str:
+    return "{" + "".join(f'"{number:x}": 1, ' for number in range(_MANY)) + '"0": 1}'
+
+
 _STEP = f"{checkpoint.FOLDER}/00000004"
 _MANIFEST, _STATE = f"{_STEP}/{checkpoint.MANIFEST}", f"{_STEP}/{checkpoint.STATE}"
-_TWICE = "{" + "".join(f'"{number:x}": 1, ' for number in range(_MANY)) + '"0": 1}'
 _ARCHIVES = ("parameters", "initial", "truth", "pictures", "sensitivity", "standard_error", "data_share")
 _KINDS = {"a pipe": _pipe, "a device": _device}
 
@@ -112,13 +121,13 @@ FOLDERS: dict[str, Hostile] = {
     },
     "resume: a pipe as the controls": _spoilt(_pipe("control.json"), _resume),
     "resume: a pipe as the lock": _spoilt(_pipe("lock"), _resume),
-    "report: 400000 arrays": _spoilt(_put("parameters.npz", names_archive(_MANY)), _page),
+    "report: 400000 arrays": _spoilt(_put("parameters.npz", lambda: names_archive(_MANY)), _page),
     "report: 400000 settings": _spoilt(_edited("run.json", lambda found: found.update(settings=_many())), _page),
-    "report: 400000 settings, the first once more": _spoilt(_put("run.json", _TWICE), _page),
+    "report: 400000 settings, the first once more": _spoilt(_put("run.json", _twice), _page),
     "report: zeros in a thousandth of their bytes": _spoilt(_bomb("parameters.npz"), _page),
     "report: zeros in a thousandth of their bytes as pictures": _spoilt(_bomb("pictures.npz"), _page),
     "resume: 400000 names in a manifest": _spoilt(_edited(_MANIFEST, lambda found: found.update(versions=_many())), _resume),
-    "resume: 400000 names in a manifest, the first once more": _spoilt(_put(_MANIFEST, _TWICE), _resume),
+    "resume: 400000 names in a manifest, the first once more": _spoilt(_put(_MANIFEST, _twice), _resume),
     "resume: 400000 parts of a state": _spoilt(
         _edited(_MANIFEST, lambda found: found.update(state={"list": [1] * _MANY})), _resume
     ),

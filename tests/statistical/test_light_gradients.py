@@ -34,16 +34,19 @@ def start(parts: Sequence[str]) -> dict[str, np.ndarray]:
     return {part: np.array(START[part], np.float64) for part in parts}
 
 
-def picture(kind: str, pose: Mapping[str, np.ndarray], spp: int, seed: int) -> np.ndarray:
-    """Return Mitsuba's picture of a scene in which the light stands at a pose."""
+def scene_at(kind: str, pose: Mapping[str, np.ndarray]) -> Any:
+    """Return Mitsuba's scene in which the light stands at a pose."""
     values: dict[str, Any] = {PARTS[part]: x if x.ndim else float(x) for part, x in pose.items()}
-    described = scene(light(kind, motion(LIGHTS[kind][0], **values)))
+    return mi.load_dict(scene(light(kind, motion(LIGHTS[kind][0], **values))))
+
+
+def picture(loaded: Any, spp: int, seed: int) -> np.ndarray:
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
-    return np.array(mi.render(mi.load_dict(described), integrator=path, spp=spp, seed=mi.UInt32(seed)), np.float64)
+    return np.array(mi.render(loaded, integrator=path, spp=spp, seed=mi.UInt32(seed)), np.float64)
 
 
-def slopes(kind: str, parts: Sequence[str], reference: np.ndarray, spp: int, seed: int) -> np.ndarray:
-    """Return the differences of the L2 loss by all elements of these parts of the pose.
+def slopes(kind: str, parts: Sequence[str], reference: np.ndarray, spp: int, seeds: int) -> np.ndarray:
+    """Return differences of the L2 loss by all elements of these parts of the pose, (seeds, n).
 
     Both ends share their random numbers. The noise of a picture adds nothing to the loss, which is a product of two independent residuals.
     """
@@ -54,10 +57,11 @@ def slopes(kind: str, parts: Sequence[str], reference: np.ndarray, spp: int, see
             for sign in (1.0, -1.0):
                 there = start(parts)
                 there[part][index] += sign * WIDTH
-                one, other = (picture(kind, there, spp, 2 * seed + half) - reference for half in (0, 1))
-                losses.append(np.mean(one * other))
-            found.append((losses[0] - losses[1]) / (2 * WIDTH))
-    return np.array(found)
+                loaded = scene_at(kind, there)
+                pairs = [[picture(loaded, spp, 2 * seed + half) - reference for half in (0, 1)] for seed in range(seeds)]
+                losses.append([np.mean(one * other) for one, other in pairs])
+            found.append(np.subtract(*losses) / (2 * WIDTH))
+    return np.stack(found, axis=1)
 
 
 def gradients(kind: str, parts: Sequence[str], reference: np.ndarray, estimator: Any, runs: int) -> np.ndarray:
@@ -76,8 +80,8 @@ def gradients(kind: str, parts: Sequence[str], reference: np.ndarray, estimator:
 def reference_and_slopes(kind: str, parts: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the reference picture, and independent slopes of the loss, (seeds, n)."""
     still = {part: np.array(1.0 if part == "scale" else np.zeros(3)) for part in parts}
-    reference = 0.5 * picture(kind, still, 256, 1000)  # darker, so that most of the slope is not at edges of shadows
-    return reference, np.stack([slopes(kind, parts, reference, SPP, seed) for seed in range(8)])
+    reference = 0.5 * picture(scene_at(kind, still), 256, 1000)  # darker, so that most of the slope is not at edges of shadows
+    return reference, slopes(kind, parts, reference, SPP, 8)
 
 
 def compare(kind: str, estimator: Any, runs: int, parts: tuple[str, ...] = ()) -> None:

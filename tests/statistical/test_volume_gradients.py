@@ -59,10 +59,9 @@ def directions(key: str, value: np.ndarray) -> list[Direction]:
     return found
 
 
-def derivative(renderer: MitsubaRenderer, current: dict[str, Any], way: Direction, seed: int) -> float:
+def derivative(renderer: MitsubaRenderer, session: Any, current: dict[str, Any], way: Direction, seed: int) -> float:
     """One noisy finite difference, without bias to second order in the step."""
     value = np.array(current[way.key]).astype(np.float64)
-    session = renderer.prepare(list(current), "path")
 
     def difference(high: float, low: float, seed: int) -> float:
         above, below = ({**current, way.key: renderer.array(value + s * way.step * way.along)} for s in (high, low))
@@ -85,9 +84,10 @@ def scores(renderer: MitsubaRenderer, gradients: Callable[[int], dict[str, Any]]
         gradient = gradients(1000 + run)
         rows.append([float((np.array(gradient[way.key]).astype(np.float64) * way.along).sum()) for way in ways])
     found = np.array(rows)
-    verdicts = {}
+    session, verdicts = renderer.prepare(keys, "path"), {}
     for number, way in enumerate(ways):
-        expected = np.array([derivative(renderer, current, way, 5000 + 2 * run) for run in range(max(8, runs // 4))])
+        seeds = range(5000, 5000 + 2 * max(8, runs // 4), 2)
+        expected = np.array([derivative(renderer, session, current, way, seed) for seed in seeds])
         a = found[:, number]
         variance = expected.var(ddof=1) / len(expected) + a.var(ddof=1) / len(a)
         t = (a.mean() - expected.mean()) / np.sqrt(variance)

@@ -282,7 +282,7 @@ def joined_views(problem: Problem, spp: int, key: Key) -> list[JoinedViews]:
     takes longer to start than to trace."""
     sizes, count = [height * width for height, width in problem.sizes], len(problem.views)
     fitting = _MOST_JOINED // (problem.max_depth * spp * max(sizes))
-    several = max((n for n in range(1, fitting + 1) if count % n == 0), default=1)
+    several = max((n for n in range(1, min(fitting, count) + 1) if count % n == 0), default=1)
     if several == 1 or (several < count and len(set(sizes)) > 1) or not _supports_joined(problem):
         return []
     frames = []
