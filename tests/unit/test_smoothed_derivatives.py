@@ -12,8 +12,8 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
+from unrender.estimators.smoothed import positive_diagonal
 from unrender.schedules import Exponential
-from unrender.statistics import hessian_updates
 
 
 def problem(n: int = 3, **more: Any) -> ur.Problem:
@@ -252,7 +252,7 @@ def test_a_diagonal_that_is_kept_is_that_of_the_loss(joint: bool, orthogonal: bo
     assert one.hvp is not None
     v = np.random.default_rng(0).normal(size=5000)
     np.testing.assert_allclose(
-        one.hvp({"x": v})["x"], hessian_updates.positive(state.hessian) * v / sigma**2, rtol=1e-5, atol=1e-6
+        one.hvp({"x": v})["x"], positive_diagonal(state.hessian) * v / sigma**2, rtol=1e-5, atol=1e-6
     )
 
 

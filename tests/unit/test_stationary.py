@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from unrender.statistics import stationary
+from unrender.runs import number_means
 
 RUNS, STEPS = 400, 300
 
@@ -42,7 +42,7 @@ def oscillating(period: float = 60.0, decay: float = 30.0, seed: int = 0) -> np.
 )
 def test_standard_errors_of_a_mean_cover_it(paths: Callable[[], np.ndarray]) -> None:
     """Of 400 sequences, some 68 % are within one standard error. 8 % are 3.4 standard deviations of that number."""
-    found = [mean for x in paths() if (mean := stationary.stationary_mean(x)) is not None]
+    found = [mean for x in paths() if (mean := number_means.stationary_mean(x)) is not None]
     assert len(found) > 0.95 * RUNS
     inside = np.mean([abs(mean.value) < mean.error for mean in found])
     assert inside == pytest.approx(0.68, abs=0.08)
@@ -57,7 +57,7 @@ def test_errors_of_independent_values_would_not_cover_it() -> None:
 def test_the_window_leaves_out_the_way_to_the_mean() -> None:
     """A start 30 standard deviations away, which decays within some 20 steps."""
     paths = wandering(0.8, 1) + 30.0 * np.exp(-np.arange(STEPS) / 8.0)
-    found = [stationary.stationary_mean(x) for x in paths]
+    found = [number_means.stationary_mean(x) for x in paths]
     assert np.mean([mean is not None for mean in found]) > 0.9
     means = np.array([mean.value for mean in found if mean is not None])
     ends = paths[:, -1]
@@ -77,17 +77,17 @@ def test_the_window_leaves_out_the_way_to_the_mean() -> None:
     ids=["slow", "fast", "straight", "constant", "short"],
 )
 def test_a_path_without_noise_has_no_mean(path: np.ndarray) -> None:
-    assert stationary.stationary_mean(path) is None
+    assert number_means.stationary_mean(path) is None
 
 
 def test_a_drift_beyond_the_noise_has_no_mean() -> None:
-    found = [stationary.stationary_mean(x + 0.05 * np.arange(STEPS)) for x in wandering(0.5, 2)]
+    found = [number_means.stationary_mean(x + 0.05 * np.arange(STEPS)) for x in wandering(0.5, 2)]
     assert np.mean([mean is None for mean in found]) > 0.98
 
 
 def test_the_long_run_variance_of_an_autoregressive_sequence() -> None:
     """(1 + ρ) / (1 − ρ) times its variance."""
-    found = np.array([stationary.long_run_variance(x) for x in wandering(0.6, 3, 2000)])
+    found = np.array([number_means.long_run_variance(x) for x in wandering(0.6, 3, 2000)])
     spread = found.std(axis=0) / np.sqrt(RUNS)
     assert found[:, 0].mean() == pytest.approx(4.0, abs=4 * spread[0] + 0.1)
     assert found[:, 1].mean() == pytest.approx(4.0, abs=4 * spread[1] + 0.1)

@@ -39,7 +39,6 @@ from unrender.estimators.smoothing.sampling import SamplingOptions
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 from unrender.schedules import Schedule
-from unrender.statistics import hessian_updates
 
 _MAX_STORED = 4096  # maximum number of parameters for which a Hessian is stored between steps
 _DIRECTIONS = 1  # stream of random numbers for the directions of products; 0 is for the perturbations
@@ -116,7 +115,7 @@ class SmoothedDerivatives:
             the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature biases products, not the gradient.
         hessian_form: "full", or "diagonal": with `hessian_rate`, only the diagonal is stored, (n,), for many weakly coupled parameters.
             Each sample determines one sum of its elements: zᵀ B z if joint, zᵀ B v otherwise. A step moves the diagonal by ω towards
-            the nearest one that satisfies all sums; the first is a multiple of the identity (`statistics/hessian_updates.py`).
+            the nearest one that satisfies all sums; the first is a multiple of the identity (`updated_hessian`).
             Products use this diagonal with elements of at least 0.15 times their mean magnitude, so that it is positive definite.
         orthogonal: see `smoothed.gradient`: with `aggregate` or `joint`, sample orthogonal directions. Use it for many parameters and
             samples: 2 n of them (4 n for products that are not joint) determine the full gradient of a linear loss.
@@ -214,7 +213,7 @@ class SmoothedDerivatives:
             gradient, error, hessian = self._stored_hessian(record_losses, *point, seed, hessian, self.hessian_rate)
             width = point[1]
             if self.hessian_form == "diagonal":
-                used, multiply = hessian_updates.positive(hessian), np.multiply
+                used, multiply = positive_diagonal(hessian), np.multiply
             else:
                 used, multiply = hessian, np.matmul
             curvature = self._curvature(lambda: used, lambda v: multiply(used, v / width) / width, parameters)
@@ -270,7 +269,7 @@ class SmoothedDerivatives:
             derivatives = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
             if self.hessian_form == "diagonal":
                 rows, values = derivatives.draws * derivatives.draws, derivatives.curvatures
-                return *derivatives.gradient(), hessian_updates.updated(stored, rows, values, rate)
+                return *derivatives.gradient(), updated_hessian(stored, rows, values, rate)
             hessian = derivatives.hessian()[0] * np.outer(sigma, sigma)
             return *derivatives.gradient(), hessian if stored is None else stored + rate * (hessian - stored)
         v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
@@ -278,10 +277,10 @@ class SmoothedDerivatives:
         both = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
         gradient, error, product = both.gradient, both.error, sigma * both.product
         if self.hessian_form == "diagonal":
-            return gradient, error, hessian_updates.updated(stored, both.draws * v, both.changes, rate)
+            return gradient, error, updated_hessian(stored, both.draws * v, both.changes, rate)
         if stored is None:
             stored, rate = float(v @ product) * np.eye(theta.size), 1.0
-        return gradient, error, hessian_updates.symmetric(stored, v, product, rate)
+        return gradient, error, symmetric_update(stored, v, product, rate)
 
     def _options(self, seed: int) -> SamplingOptions:
         return SamplingOptions(
@@ -327,3 +326,68 @@ def _convergence(losses: np.ndarray, center: float) -> float:
     differences = losses - center
     root_mean_square = float(np.sqrt(np.mean(differences * differences)))
     return max(0.0, float(np.mean(differences))) / root_mean_square if root_mean_square > 0.0 else 0.0
+
+
+# ---------------------------------------------------------------------- Hessian from curvatures along random directions
+#
+# A full matrix B moves towards the nearest symmetric matrix with B v = h, where h is the product of the Hessian with a direction v: Powell's
+# symmetric Broyden update; Gower and Richtárik 2017 on random directions.
+#
+# For a diagonal H, zᵀ H v = Σᵢ zᵢ vᵢ Hᵢᵢ is linear in the diagonal, so each pair of directions gives one equation. A step moves the
+# diagonal by a fraction ω of the smallest change, in the Euclidean norm, that satisfies all its equations. With one equation and v = z this
+# is the quasi-Cauchy update of Zhu, Nazareth and Wolkowicz 1999; with several it is the block method of Kaczmarz. n independent equations
+# determine the diagonal. The off-diagonal elements of H average out over steps if the directions have independent random signs.
+
+LEAST = 0.15
+"""Smallest usable element of a diagonal, relative to the mean magnitude of its elements."""
+RIDGE = 0.01
+"""Regularisation of the equations, relative to their mean squared row length. It damps equations that nearly repeat others."""
+
+
+def symmetric_update(matrix: np.ndarray, v: np.ndarray, product: np.ndarray, rate: float) -> np.ndarray:
+    """Return the symmetric B (n, n) moved by `rate` in (0, 1] towards the nearest symmetric one with B v = `product`, v a unit vector."""
+    missing = product - matrix @ v
+    update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
+    return matrix + rate * update
+
+
+def isotropic_fit(rows: np.ndarray, values: np.ndarray) -> float:
+    """Return the least-squares solution c of rows · (c, c, ...) = values, with rows (B, n) and values (B,); 0 where every row sums to
+    0."""
+    sums = rows.sum(axis=1)
+    square = float(sums @ sums)
+    return float(sums @ values) / square if square > 0.0 else 0.0
+
+
+def corrected_diagonal(diagonal: np.ndarray, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """Return the diagonal d (n,) moved by the fraction ω = `rate` in (0, 1] toward the nearest solution of A d = y.
+
+    A is `rows` (B, n) and y is `values` (B,). The result is d + ω Aᵀ (A Aᵀ + ρ I)⁻¹ (y − A d), with ρ from `RIDGE`. Takes O(B² n + B³)
+    time and O(B n + B²) memory.
+    """
+    gram = rows @ rows.T
+    ridge = RIDGE * float(np.mean(np.diagonal(gram)))
+    if ridge == 0.0:
+        return diagonal.copy()
+    gram[np.diag_indices(len(gram))] += ridge
+    return diagonal + rate * (rows.T @ np.linalg.solve(gram, values - rows @ diagonal))
+
+
+def updated_hessian(stored: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """Return the diagonal after a step's equations, (n,): `corrected_diagonal`, from `isotropic_fit` if there is none yet.
+
+    Args:
+        stored: diagonal before the step, (n,), or None.
+        rows, values, rate: see `corrected_diagonal`.
+    """
+    before = np.full(rows.shape[1], isotropic_fit(rows, values)) if stored is None else stored
+    return corrected_diagonal(before, rows, values, rate)
+
+
+def positive_diagonal(diagonal: np.ndarray) -> np.ndarray:
+    """Clamp the elements of a diagonal (n,) to at least `LEAST` times their mean magnitude.
+
+    The result is positive definite unless all elements are 0. Elements that are small or negative only because of noise would otherwise
+    cause the longest steps.
+    """
+    return np.maximum(diagonal, LEAST * float(np.mean(np.abs(diagonal))))
