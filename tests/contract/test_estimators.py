@@ -132,6 +132,7 @@ DEAR = {
     "Gauss-Newton",
     "control variate, own paths",
     "plain, adaptive pixels, own paths",
+    "plain, adaptive pixels",
 }
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient and estimators that differ by one
 option stand for them."""

@@ -58,7 +58,9 @@ def slopes(kind: str, parts: Sequence[str], reference: np.ndarray, spp: int, see
                 there = start(parts)
                 there[part][index] += sign * WIDTH
                 loaded = scene_at(kind, there)
-                pairs = [[picture(loaded, spp, 2 * seed + half) - reference for half in (0, 1)] for seed in range(seeds)]
+                pairs = [
+                    [picture(loaded, spp, 2 * seed + half) - reference for half in (0, 1)] for seed in range(seeds)
+                ]
                 losses.append([np.mean(one * other) for one, other in pairs])
             found.append(np.subtract(*losses) / (2 * WIDTH))
     return np.stack(found, axis=1)
@@ -80,7 +82,9 @@ def gradients(kind: str, parts: Sequence[str], reference: np.ndarray, estimator:
 def reference_and_slopes(kind: str, parts: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the reference picture, and independent slopes of the loss, (seeds, n)."""
     still = {part: np.array(1.0 if part == "scale" else np.zeros(3)) for part in parts}
-    reference = 0.5 * picture(scene_at(kind, still), 256, 1000)  # darker, so that most of the slope is not at edges of shadows
+    reference = 0.5 * picture(
+        scene_at(kind, still), 256, 1000
+    )  # darker, so that most of the slope is not at edges of shadows
     return reference, slopes(kind, parts, reference, SPP, 8)
 
 
@@ -96,7 +100,8 @@ def compare(kind: str, estimator: Any, runs: int, parts: tuple[str, ...] = ()) -
     assert np.abs(z_scores(0.75 * found[:, seen], expected[:, seen])).max() > limit, "a lost quarter went unseen"
 
 
-@pytest.mark.parametrize("kind", quick(KINDS, "point"))
+@pytest.mark.slow  # in the quick tier, render/test_light_poses.py compares pictures of all posed lights with those of moved lights
+@pytest.mark.parametrize("kind", KINDS)
 def test_gauss_newton_gradients_are_the_slope_of_the_loss(kind: str) -> None:
     """The widths of its differences are as small as those here: at five times the shift, edges of shadows cross several pixels."""
     compare(kind, ur.GaussNewton(shift=0.01, derivative_spp=256), 12)

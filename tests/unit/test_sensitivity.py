@@ -54,7 +54,7 @@ def test_noise_of_the_adjoint_would_be_counted_without_separate_paths(monkeypatc
         return real(problem, session, parameters, keys, spp, key, 0, *more)
 
     monkeypatch.setattr(module, "_projections", same)
-    assert z_score() > 8
+    assert z_score(2000) > 8
 
 
 def test_cells_that_no_pixel_sees_are_hardly_seen():

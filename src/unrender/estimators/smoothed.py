@@ -330,8 +330,8 @@ def _convergence(losses: np.ndarray, center: float) -> float:
 
 # ---------------------------------------------------------------------- Hessian from curvatures along random directions
 #
-# A full matrix B moves towards the nearest symmetric matrix with B v = h, where h is the product of the Hessian with a direction v: Powell's
-# symmetric Broyden update; Gower and Richtárik 2017 on random directions.
+# A full matrix B moves towards the nearest symmetric matrix with B v = h, where h is the product of the Hessian with a direction v:
+# Powell's symmetric Broyden update; Gower and Richtárik 2017 on random directions.
 #
 # For a diagonal H, zᵀ H v = Σᵢ zᵢ vᵢ Hᵢᵢ is linear in the diagonal, so each pair of directions gives one equation. A step moves the
 # diagonal by a fraction ω of the smallest change, in the Euclidean norm, that satisfies all its equations. With one equation and v = z this
