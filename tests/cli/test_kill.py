@@ -190,16 +190,6 @@ def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
         assert states(folder) == states(whole), (name, number)
 
 
-@pytest.mark.slow  # in the quick tier, one command is killed and resumed
-def test_some_are_killed(killer: Killer, tmp_path: Path) -> None:
-    kill_analytic(killer, tmp_path, 5, seed=1)
-
-
-@pytest.mark.slow
-def test_one_command_is_killed(tmp_path: Path) -> None:
-    kill_commands(tmp_path, 1, seed=2)
-
-
 @pytest.mark.slow
 def test_many_are_killed(killer: Killer, tmp_path: Path) -> None:
     kill_analytic(killer, tmp_path, 78, seed=3)

@@ -691,6 +691,15 @@ def test_photographs_are_reflectances(name):
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), parts.photograph(name, 128).mean(axis=(0, 1)), atol=0.01)
 
 
+def test_a_photograph_is_smoothed_once_and_each_caller_has_its_own(monkeypatch: pytest.MonkeyPatch):
+    resized, calls = parts._resized, []
+    monkeypatch.setattr(parts, "_resized", lambda *given: calls.append(given) or resized(*given))
+    first = parts.photograph("coffee", 3)
+    first[:] = 0
+    assert parts.photograph("coffee", 3).min() >= np.float32(parts.DARKEST)
+    assert len(calls) == 1
+
+
 def test_a_bitmap_keeps_its_values_and_stands_upright():
     values = np.arange(12, dtype=np.float32).reshape(2, 2, 3) / 12
     texture = mi.load_dict(parts.bitmap(values))

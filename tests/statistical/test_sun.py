@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -59,6 +60,11 @@ def mitsuba_images(description: dict[str, Any], first: int) -> np.ndarray:
     return np.array([mi.render(loaded, integrator=path, spp=SPP, seed=mi.UInt32(seed)) for seed in seeds], float)
 
 
+@cache
+def stock_images(first: int) -> np.ndarray:
+    return mitsuba_images(scene(), first)
+
+
 def images(of: MitsubaRenderer, values: dict[str, Any], seed: int, emitters: Any = None) -> np.ndarray:
     session = of.prepare(list(values), None, derivatives=False)
     request = SampleRequest(0, GROUPS * SPP, seed, GROUPS, emitters=emitters)
@@ -71,7 +77,7 @@ def states(of: MitsubaRenderer, key: str) -> tuple[Any, Any]:
 
 def test_the_sun_is_as_bright_as_in_mitsuba_and_its_edge_is_seen() -> None:
     """Of four parts in a thousand that were missing, two would be seen."""
-    ours, theirs = images(renderer(ALBEDO), {}, 1), mitsuba_images(scene(), 100)
+    ours, theirs = images(renderer(ALBEDO), {}, 1), stock_images(100)
     assert agree(ours, theirs, size=8)
     assert not agree(0.998 * ours, theirs, size=8), "two parts in a thousand went unseen"
 
@@ -81,7 +87,7 @@ def test_with_other_probabilities_of_the_emitters_it_is_as_bright() -> None:
     lamp = {"type": "point", "position": [0, 2, 0], "intensity": 0.0}
     of = renderer(ALBEDO, lamp=lamp)
     suns = ["Sun" in emitter.class_name() for emitter in mi.load_dict({**scene(), "lamp": lamp}).emitters()]
-    ours, theirs = images(of, {}, 1, np.where(suns, 0.998, 0.002)), mitsuba_images(scene(), 100)
+    ours, theirs = images(of, {}, 1, np.where(suns, 0.998, 0.002)), stock_images(100)
     assert agree(ours, theirs, size=8)
     assert not agree(0.998 * ours, theirs, size=8), "two parts in a thousand went unseen"
 
@@ -97,7 +103,7 @@ def test_both_images_of_a_pair_agree_with_separate_renders(key: str, space: Spac
     )
     for shared, values in ((pair.images, now), (pair.previous, before)):
         assert agree(np.array(shared, float), images(of, values, 2), size=8)
-    assert agree(np.array(pair.previous, float), mitsuba_images(scene(), 100), size=8)
+    assert agree(np.array(pair.previous, float), stock_images(100), size=8)
 
 
 @pytest.mark.parametrize("key", [TURBIDITY, SUN, TURN])
@@ -112,7 +118,7 @@ def test_differences_of_images_are_those_of_mitsuba_s(key: str) -> None:
         TURN: {"sun_direction": np.array(turned.matrix)[:3, :3] @ [0.3, 0.86, 0.4], "to_world": turned @ turn(-90)},
     }[key]
     ours = images(of, now, 1) - images(of, before, 2)
-    theirs = mitsuba_images(scene(**sky), 100) - mitsuba_images(scene(), 200)
+    theirs = mitsuba_images(scene(**sky), 100) - stock_images(200)
     assert agree(ours, theirs, size=8)
     assert not agree(0.998 * ours, theirs, size=8), "two parts in a thousand went unseen"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -191,6 +192,11 @@ DARKEST, BRIGHTEST = 0.04, 0.9
 
 def photograph(name: Photograph, resolution: int) -> np.ndarray:
     """Return the central square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
+    return _photograph(name, resolution).copy()
+
+
+@lru_cache(maxsize=16)  # a problem makes its scene several times, and smoothing takes a third of a second
+def _photograph(name: Photograph, resolution: int) -> np.ndarray:
     picture = _read(name)
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
