@@ -85,9 +85,9 @@ def count_scenes() -> None:
 
     instantiate = Parsed.instantiate
 
-    def counted(parsed: Parsed) -> Any:
+    def counted(self: Parsed) -> Any:
         SCENES[0] += 1
-        return instantiate(parsed)
+        return instantiate(self)
 
     Parsed.instantiate = counted
 

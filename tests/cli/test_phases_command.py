@@ -61,6 +61,7 @@ def test_options_are_refused_before_anything_is_loaded(unrender, problem: Path, 
     assert not answer.out
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_what_will_hardly_do_is_said_before_the_first_step(unrender, problem: Path, mitsuba_variant: str) -> None:
     words = ["run", "problem.toml", "--steps", 1, "--out", "result", "--variant", mitsuba_variant, *QUICK]
     answer = unrender(*words, "-m", "rcv", "-s", "learning_rate=2")
@@ -94,6 +95,7 @@ def test_a_sensor_under_a_shared_path_names_the_methods(problem: Path, mitsuba_v
         ur.optimize(ur.Problem.from_file(made), "rcv", steps=1)
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_references_are_rendered_anew_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str
 ) -> None:

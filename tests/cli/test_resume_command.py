@@ -15,6 +15,7 @@ import unrender as package
 from unrender.runs.folder import checkpoint
 
 QUICK = ["--final-spp", "4"]
+pytestmark = pytest.mark.usefixtures("short_ends")  # tests/render/test_resume.py has whole ends
 
 
 @pytest.fixture

@@ -55,6 +55,7 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
 
 
 @pytest.mark.parametrize("method", quick(["meta", "coupled"], "coupled"))
+@pytest.mark.usefixtures("short_ends")
 def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsuba_variant: str, method: str):
     words = ["run", "problem.toml", "--method", method, "--steps", 120, "--out", "result", "--variant", mitsuba_variant]
     answer = unrender(*words, *QUICK, "--set", "learning_rate=0.004")
@@ -114,6 +115,7 @@ def test_run_takes_emitters_by_the_gradient_s_variance(unrender, problem: Path, 
     assert "option emitters: expected scene or adaptive, got 'power'" in wrong.error
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_run_names_a_new_folder_each_time(unrender, tmp_path: Path, mitsuba_variant: str):
     for _ in range(2):
         words = ["run", "exponential", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant]
@@ -143,6 +145,7 @@ def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_va
     assert not (problem.parent / "result").exists()
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_run_says_what_was_done_to_the_input_and_warns_of_a_parameter_without_influence(
     unrender, problem: Path, mitsuba_variant: str
 ):
@@ -160,6 +163,7 @@ def test_run_says_what_was_done_to_the_input_and_warns_of_a_parameter_without_in
     assert "warning parameter hidden.bsdf.reflectance.value: its gradient is zero" in answer.out
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mitsuba_variant: str):
     words = ["compare", "problem.toml", "--methods", "plain,rcv", "--seconds", 0.2, "--seeds", 2, "--out", "both"]
     words += ["--set", "rcv.spp=4", "--set", "learning_rate=0.02", "--variant", mitsuba_variant, *QUICK]
@@ -194,6 +198,7 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     assert unrender(*words).error.startswith("unrender: --out both: contains earlier results")
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_compare_takes_equal_steps(unrender, problem: Path, mitsuba_variant: str):
     words = [
         "compare",
