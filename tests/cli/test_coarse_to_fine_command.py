@@ -40,4 +40,4 @@ def test_runs_are_resumed_across_a_change_and_shown(unrender, problem: Path, mit
     problem.write_text(problem.read_text().replace("[2, 4]", "[2, 9, 4]"))
     refused = unrender(*run, "--steps", 3, "--overwrite")
     assert refused.status == 2
-    assert "problem.toml:6: parameters[0].coarse_to_fine: CoarseToFine: steps must be" in refused.error
+    assert "problem.toml:6: parameters[0].coarse_to_fine: steps must be" in refused.error

@@ -19,6 +19,7 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.picture_format import AOVS
 from unrender.rendering.renderer import SampleRequest
+from unrender.runs.determination import undetermined
 from unrender.scene.fingerprint import fingerprint
 
 pytestmark = pytest.mark.mitsuba
@@ -145,6 +146,17 @@ def test_albedo_and_depth_share_one_descent(method: str) -> None:
     result = ur.optimize(made, method, steps=60)
     assert made.parameter_error(result.parameters)[FLOOR] < 0.05
     assert ur.render(made, view=1, spp=64)[SIZE // 2, SIZE // 2, 0] == pytest.approx(3.3, abs=0.1)
+
+
+def test_depths_do_not_hide_changes_of_colour_from_tests() -> None:
+    """A light 1.2 times as bright was "not determined": it changes pictures by little beside distances of 4."""
+    key = "light.intensity.value"
+    views = [ur.View(np.full((SIZE, SIZE, 3), 0.04)), ur.View(np.full((SIZE, SIZE), 4.0), aov="depth")]
+    made = problem(views, (key,))
+    weights = [made.test_weights(view).mean() for view in (0, 1)]
+    assert weights == pytest.approx([1.0, 1e-4])
+    assert problem(views[:1], (key,)).test_weights(0).mean() == 1.0
+    assert not undetermined(made, {key: np.full(3, 12.0, np.float32)}, 16)
 
 
 @pytest.mark.parametrize("name", ["depth", "mask"])

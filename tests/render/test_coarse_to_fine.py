@@ -138,7 +138,7 @@ def test_shapes_by_step() -> None:
         (lambda: ur.scene.CoarseToFine((4,), states="keep"), 'states must be "estimator", "carry" or "reset", got \'keep\''),  # type: ignore
         (lambda: problem((1, 2, 3, 4)), "coarse_to_fine: shape .* is too small to be coarser 4 times by 2"),
         (lambda: problem(ur.scene.CoarseToFine((1,), wrap=(True,))), "coarse_to_fine: wrap must have 2 entries"),
-        (lambda: problem("soon"), "coarse_to_fine: CoarseToFine: steps must be whole numbers"),
+        (lambda: problem("soon"), "coarse_to_fine: steps must be whole numbers"),
         (lambda: problem({"step": 3}), "coarse_to_fine: CoarseToFine has no option step"),
     ],
 )  # fmt: skip
@@ -736,9 +736,7 @@ def test_an_interpolated_field_looks_the_same(folder: Path) -> None:
 
 def test_a_schedule_that_makes_no_sense_is_told_with_its_line(folder: Path) -> None:
     (folder / "problem.toml").write_text(PROBLEM.replace("[2, 4]", "[4, 2]"))
-    with pytest.raises(
-        InputError, match=r"problem\.toml:6: parameters\[0\]\.coarse_to_fine: CoarseToFine: steps must be"
-    ):
+    with pytest.raises(InputError, match=r"problem\.toml:6: parameters\[0\]\.coarse_to_fine: steps must be"):
         ur.Problem.from_file(folder / "problem.toml")
     (folder / "problem.toml").write_text(PROBLEM.replace("[2, 4]", "2"))
     with pytest.raises(InputError, match=r"problem\.toml:6: parameters\[0\]\.coarse_to_fine: expected a list of steps"):

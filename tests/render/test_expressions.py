@@ -431,3 +431,12 @@ def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
     whole = ur.optimize(made, *parts, steps=4)
     ur.optimize(made, *parts, steps=2, run_directory=tmp_path)
     assert ur.resume(tmp_path, made, steps=4).parameters["strength"] == pytest.approx(whole.parameters["strength"])
+
+
+def test_an_unknown_number_sets_a_number_of_the_scene() -> None:
+    """Its shape (1,) was refused for the shape () of a translation or a roughness."""
+    key = "left.translation.x"
+    made = problem(np.zeros((8, 8, 3)), {key: "0.5 * place"}, ur.Parameter("place", initial=0.4))
+    found = scene_values(made.renderer, {"place": np.array([0.6], np.float32)})
+    assert found[key] == pytest.approx(0.3)
+    assert found[key].shape == ()

@@ -323,6 +323,8 @@ def test_a_tie_may_have_a_member_that_all_views_know() -> None:
     np.testing.assert_allclose(one, other, rtol=1e-5)
     with pytest.raises(InputError, match="lamps is known in all views"):
         made.replaced(views=[ur.View(picture(), known={LAMP: DARK, left: DARK})])
+    with pytest.raises(InputError, match="no parameter lamps; give the parameters of the scene that this unknown sets"):
+        made.replaced(views=[ur.View(picture(), known={"lamps": DARK})])
 
 
 def test_a_stage_has_a_scene_though_the_first_view_knows_what_is_fixed(tmp_path: Path) -> None:

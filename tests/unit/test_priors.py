@@ -211,6 +211,13 @@ def test_a_descent_ends_at_the_posterior_mean() -> None:
     assert result.verification["best"] == "end"
 
 
+def test_the_noise_of_renderings_is_no_standard_error_beside_a_prior() -> None:
+    """A run had one of a hundredth of the prior's, and `uncertainty` said that there is none."""
+    for prior in (None, {"near": 0.5, "std": 0.1}):
+        run = ur.optimize(linear(prior)[0], ur.GaussNewton(8), ur.optimizers.AveragedNewton(), steps=30)
+        assert ("x" in run.standard_error) == (prior is None)
+
+
 def test_a_better_posterior_with_a_worse_picture_is_no_failure() -> None:
     """A descent that starts at the best picture moves to the prior, and the check at the end counts both."""
     _, matrix, y = linear(None)
@@ -286,7 +293,7 @@ def test_every_derivative_of_an_estimate_has_the_priors_part() -> None:
     ],
 )
 def test_a_prior_that_does_not_suit_is_refused_in_one_line(prior: Any, message: str) -> None:
-    with pytest.raises(InputError, match=r"parameter x: prior") as caught:
+    with pytest.raises(InputError, match=r"parameter x: prior: (?!prior)") as caught:
         linear(prior, bounds=(0.0, 1.0))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)

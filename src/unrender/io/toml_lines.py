@@ -267,8 +267,11 @@ class FieldError(InputError):
     @classmethod
     @contextmanager
     def at(cls, place: Place, owner: str | None = None) -> Iterator[None]:
-        """Raise the `InputError` of a block as the error of a field."""
+        """Raise the `InputError` of a block as the error of a field. A message that begins with the field's name, or that of its class,
+        has it once."""
         try:
             yield
         except InputError as error:
-            raise cls(place, str(error), owner) from error
+            first, colon, rest = str(error).partition(": ")
+            repeated = colon and first.lower() == str(place[-1]).replace("_", "").lower()
+            raise cls(place, rest if repeated else str(error), owner) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -260,6 +261,8 @@ def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
         result = type(like)(result)
     if tuple(result.shape) == shape:
         return result
+    if not shape and math.prod(result.shape) == 1:  # an unknown number has the shape (1,)
+        return dr.reshape(result, shape)
     try:
         spread = np.broadcast_shapes(tuple(result.shape), shape)
     except ValueError:

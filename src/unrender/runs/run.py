@@ -150,11 +150,12 @@ class Run:
         )
 
     def _standard_errors(self) -> dict[str, np.ndarray]:
-        """Return the standard error of the parameters that have one, in their units."""
+        """Return the standard error of the parameters that have one, in their units; none with a prior, which has its own width."""
         if not isinstance(self.optimizer, Measuring):
             return {}
         coordinates = self.problem.coordinates
         errors = self.optimizer.standard_errors(self.state.optimizer, coordinates.of(self.parameters))
+        errors = {key: x for key, x in errors.items() if self.problem.unknowns[key].prior is None}
         slopes = coordinates.slopes({key: self.parameters[key] for key in errors})
         by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in errors.items()}
         return {key: x.astype(np.float32) for key, x in by_x.items()}

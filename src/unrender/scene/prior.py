@@ -262,14 +262,16 @@ def _values(near: Any, initial: np.ndarray, channels: int) -> np.ndarray:
         return initial.astype(np.float64)
     values = _numbers("near", near)
     if values.ndim > 1 or values.size not in (1, channels):
-        raise InputError(f"prior: near must be a number or {channels} numbers, got an array of shape {values.shape}")
+        expected = "a number" if channels == 1 else f"a number or {channels} numbers"
+        raise InputError(f"prior: near must be {expected}, got an array of shape {values.shape}")
     return np.broadcast_to(values, (channels,)).copy()
 
 
 def _palette(palette: Any, channels: int) -> np.ndarray:
     colours = _numbers("palette", palette)
     if colours.ndim != 2 or not len(colours) or colours.shape[1] != channels:
-        raise InputError(f"prior: palette must be a list of colours of {channels} numbers each")
+        each = "1 number" if channels == 1 else f"{channels} numbers"
+        raise InputError(f"prior: palette must be a list of colours of {each} each")
     return colours
 
 

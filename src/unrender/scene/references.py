@@ -22,6 +22,7 @@ import warnings
 
 from unrender.losses import Censored, Loss
 from unrender.losses.pixelwise import determined_pixels
+from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Renderer
 
 ON_DEVICE = 1 << 29
@@ -214,12 +215,30 @@ class ViewLosses:
             self._masks[view] = array
         return array
 
+    @cached_property
+    def _unit_weights(self) -> list[float] | None:
+        """Ratios of the mean square of the first kind of references, colour if there is any, to that of each view's kind; None for one
+        kind."""
+        kinds = [format_of(self.renderer, view.sensor).aov for view in self.views]
+        if len(set(kinds)) == 1:
+            return None
+        squares = {
+            kind: np.mean(
+                [np.mean(np.square(view.reference)) for view, own in zip(self.views, kinds, strict=True) if own == kind]
+            )
+            for kind in sorted(set(kinds))
+        }
+        first = next(iter(squares.values()))
+        return [float(first / squares[kind]) if first > 0 and squares[kind] > 0 else 1.0 for kind in kinds]
+
     def test_weights(self, view: int, images: Sequence[np.ndarray] = ()) -> np.ndarray:
         """Return the weight (H, W) of each pixel in tests of pictures: the mask's, and 0 for lower bounds of `Censored`.
 
-        Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there.
+        Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there. Views of AOVs
+        beside others have weights of their unit, so that their references have the mean square of those of colour.
         """
         weights = self.views[view].pixel_weights(self.sizes[view])
+        weights = weights if self._unit_weights is None else weights * self._unit_weights[view]
         if not isinstance(self.loss, Censored):
             return weights
         return weights * determined_pixels(

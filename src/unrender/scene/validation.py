@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -158,24 +158,15 @@ def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo
     if start is not None:
         changes["first"] = unknown.placed(start)
     if "parameterisation" in own:
-        with _about(unknown, "parameterisation"):
+        with FieldError.at(("parameterisation",), f"parameter {unknown.parameter.key}: parameterisation"):
             pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
         changes |= {"parameterisation": pair[0], "transform": pair[1]}
     if "preconditioner" in own:
         changes["preconditioner"] = _check_preconditioner(unknown.parameter.key, own["preconditioner"], info)
     if "coarse_to_fine" in own:
-        with _about(unknown, "coarse_to_fine"):
+        with FieldError.at(("coarse_to_fine",), f"parameter {unknown.parameter.key}: coarse_to_fine"):
             _check_resolutions(own["coarse_to_fine"], info)
     return replace(unknown, parameter=replace(unknown.parameter, **own), **changes)
-
-
-@contextmanager
-def _about(unknown: Unknown, field: str) -> Iterator[None]:
-    """Put the parameter and a field before the message of an `InputError`."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"parameter {unknown.parameter.key}: {field}: {error}") from error
 
 
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
@@ -207,14 +198,11 @@ def _check_parameterisation(
     parameterisation: Any, bounds: Bounds, initial: np.ndarray
 ) -> tuple[Parameterisation, Transform | None]:
     """Return a parameterisation, made from its name or table, and its φ. Raises `InputError`."""
-    try:
-        made = (
-            tables.component(parameterisation, "parameterisation")
-            if isinstance(parameterisation, (str, Mapping))
-            else parameterisation
-        )
-    except InputError as error:
-        raise InputError(str(error).removeprefix("parameterisation: ")) from error
+    made = (
+        tables.component(parameterisation, "parameterisation")
+        if isinstance(parameterisation, (str, Mapping))
+        else parameterisation
+    )
     if isinstance(made, type) or not isinstance(made, Parameterisation):
         raise InputError(
             f"expected one of unrender.parameterisations, or its name, got {shorten(repr(parameterisation), 60)}"

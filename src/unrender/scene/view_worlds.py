@@ -61,7 +61,7 @@ def of_views(
             check_sensor(index, view, len(own.resolutions()))
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
-        worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
+        worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters(), keys))
     made, sensors = with_worlds(renderer, list(worlds.values()), len(worlds) < len(views))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
@@ -182,14 +182,18 @@ def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
     raise FieldError(place, "this renderer has radiance only; leave it out", owner)
 
 
-def _values(index: int, known_values: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:
+def _values(
+    index: int, known_values: Any, known: Mapping[str, ParameterInfo], unknowns: Sequence[str]
+) -> dict[str, np.ndarray]:
     place, owner = ("views", index, "with"), f"view {index}: known"
     if not isinstance(known_values, Mapping):
         raise FieldError(place, f"expected a table of values by key, got {known_values!r:.60}", owner)
     values = {}
     for key, value in known_values.items():
         if key not in known:
-            raise FieldError(place, f"the scene has no parameter {key}{did_you_mean(str(key), known)}", owner)
+            derived = "; give the parameters of the scene that this unknown sets" if key in unknowns else ""
+            what = f"the scene has no parameter {key}{derived or did_you_mean(str(key), known)}"
+            raise FieldError(place, what, owner)
         info = known[key]
         if not info.perturbable:
             raise FieldError(place, f"{key} cannot have a value of its own: {info.reason}", owner)
