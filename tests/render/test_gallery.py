@@ -78,7 +78,11 @@ MESHES = [
     "relief",
     "lenses",
 ]  # test_shapes.py, test_mesh_runs.py, test_relief.py, test_lenses.py
-WORLDS_AND_PRIORS = ["one-jar", "noisy-tiles"]  # see test_view_worlds.py, test_rendered_priors.py
+WORLDS_AND_PRIORS = [
+    "one-jar",
+    "noisy-tiles",
+    "two-posters",
+]  # see test_view_worlds.py, test_rendered_priors.py, test_ties.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 

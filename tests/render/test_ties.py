@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.app.exporting import scene_folder
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.parameter_errors import Role
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
@@ -240,3 +241,19 @@ def test_a_wrong_tie_in_a_file_is_one_line_that_names_its_line(
     assert line in str(caught.value)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_ends")
+def test_a_pattern_of_two_posters_and_the_paint_of_their_boards_are_recovered(tmp_path: Path) -> None:
+    """The export's textures and paints are those of the result, by the expressions and the tie's factors."""
+    made = ur.gallery.problem("two-posters", resolution=24, texture_resolution=8)
+    result = ur.optimize(made, steps=40, progress=False, run_directory=tmp_path / "run")
+    before, after = (made.parameter_error(values) for values in (result.initial, result.parameters))
+    assert after["pattern"] < 0.2 * before["pattern"]
+    assert after["boards"] < 0.02
+    scene_folder.export((made, result.parameters), tmp_path / "asset")
+    shown = np.array(mi.render(mi.load_file(str(tmp_path / "asset" / "scene.xml")), spp=512))[..., :3]
+    np.testing.assert_allclose(
+        shown.mean(axis=(0, 1)), ur.render(made, result.parameters, spp=512).mean(axis=(0, 1)), rtol=0.01
+    )

@@ -26,7 +26,8 @@ LEFT_OUT = (
     "statue",
     "relief",
     "one-jar",
-)  # three as sphere-to-mesh; the views of the last two are of worlds, and the export is of the problem's scene
+    "two-posters",
+)  # three as sphere-to-mesh; the views of the next two are of worlds, and the export is of the problem's scene; see test_ties.py
 RENDERED = [name for name in ur.gallery.names() if name not in LEFT_OUT]
 
 

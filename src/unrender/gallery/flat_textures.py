@@ -1,4 +1,5 @@
-"""Problems `poster`, `noisy-tiles` and `caustic`: a flat texture in direct light, with a prior too, and the tiles of a floor in caustics.
+"""Problems `poster`, `noisy-tiles`, `two-posters` and `caustic`: a flat texture in direct light, with a prior too, a pattern of two
+posters, and the tiles of a floor in caustics.
 
 `poster`, TEXTURE of Wang et al., section 4, shows how derivatives from perturbed renders scale with the dimension, and why an n × n matrix
 must not be formed. Path gradients, whose cost does not depend on the number of texels, solve it easily.
@@ -31,6 +32,11 @@ _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75
 _COLOURS = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
 _SHADES = (1.1, 0.75)
 """Colours of the tiles, and factors of light and dark ones."""
+
+_MIXED = {"left": ((0.1, 0.1, 0.25), (0.9, 0.8, 0.6)), "right": ((0.7, 0.2, 0.1), (0.2, 0.5, 0.8))}
+"""Colours of the posters of `two-posters` where the pattern is 0 and 1."""
+_BOARDS, _SHARES = np.array([0.7, 0.5, 0.3]), {"left": 1.0, "right": 0.5}
+"""Paint of its boards, and the factor of each."""
 
 _PRIORS = ("total_variation", "palette", "none")
 
@@ -100,6 +106,44 @@ class NoisyTiles(Poster):
         (view,) = views_of(load(self.scene), self)
         counted = np.random.default_rng(0).poisson(self.photons * np.asarray(view.reference))
         return build_problem(name, self, [replace(view, reference=(counted / self.photons).astype(np.float32))])
+
+
+@register(name="two-posters", position=38)
+@dataclass(frozen=True)
+class TwoPosters(Poster):
+    """The pattern that two posters of different colours share, and the paint of both boards behind them.
+
+    One view. The pattern (texture_resolution², 1) is an unknown of two expressions, one per poster: each mixes two known colours by it. The
+    paint of the boards is one unknown for both, and half as bright on the right.
+    """
+
+    def scene(self) -> dict[str, Any]:
+        """Return both posters, before boards, with the pattern and the paint at their true values."""
+        pattern, stage = self.texture(), super().scene()
+        del stage["poster"]
+        for (name, share), x in zip(_SHARES.items(), (-0.52, 0.52), strict=True):
+            one, other = np.array(_MIXED[name])
+            texels = parts.bitmap(one + pattern * (other - one)) | {"filter_type": "nearest"}
+            paint = {"type": "diffuse", "reflectance": texels}
+            stage[name] = parts.rectangle((x, 0, 0), (0.42, 0, 0), (0, 0.42, 0), paint)
+            board = parts.diffuse(*(share * _BOARDS))
+            stage[f"{name}_board"] = parts.rectangle((x, 0, -0.01), (0.48, 0, 0), (0, 0.6, 0), board)
+        return stage
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        boards = {f"{name}_board.bsdf.reflectance.value": share for name, share in _SHARES.items()}
+        pattern = np.full((self.texture_resolution, self.texture_resolution, 1), 0.5)
+        return Parameter("pattern", initial=pattern, bounds=(0.0, 1.0)), Parameter("boards", initial=0.5, keys=boards)
+
+    def problem(self, name: str) -> Problem:
+        texts = {
+            f"{name}.bsdf.reflectance.data": f"mix({list(one)}, {list(other)}, pattern)"
+            for name, (one, other) in _MIXED.items()
+        }
+        views, truth = views_of(load(self.scene), self), {"pattern": self.texture(), "boards": _BOARDS}
+        return Problem(
+            self.scene, self.parameters(), views, self.loss, self.max_depth, expressions=texts, truth=truth, name=name
+        )
 
 
 @register(name="caustic", position=12)
