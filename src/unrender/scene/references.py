@@ -224,7 +224,11 @@ class ViewLosses:
             return None
         squares = {
             kind: np.mean(
-                [np.mean(np.square(view.reference)) for view, own in zip(self.views, kinds, strict=True) if own == kind]
+                [
+                    np.mean(np.square(np.asarray(view.reference, np.float32)))
+                    for view, own in zip(self.views, kinds, strict=True)
+                    if own == kind
+                ]
             )
             for kind in sorted(set(kinds))
         }
