@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,9 @@ _PATIENCE = 20.0
 
 _LONGEST = 1000.0
 """Seconds of a run that its samples end."""
+
+_BATCHES, _BETTER = 8, 0.4
+"""Largest number of batches of a search, and the share of the start's loss that ends it."""
 
 _IMAGES = 48
 _IMAGE_SPP = 16
@@ -117,12 +120,63 @@ class Track(ur.protocols.Callback):
         )
 
 
+@dataclass(frozen=True)
+class Search:
+    """Draws around the start, in batches of one launch each, until one has a much smaller loss in small pictures.
+
+    Attributes:
+        small: the problem on a small film.
+        widths: standard deviation of each number, (n,).
+        draws: points of a batch, the best so far among them.
+    """
+
+    small: ur.Problem
+    widths: np.ndarray
+    draws: int
+
+    def best(self, start: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
+        """Return the best point, and the samples of all pictures."""
+        losses_at = black_box(self.small, self.small.initial(), 1, Key(seed))
+        generator, best, samples, first = np.random.default_rng([5, seed]), start, 0.0, math.inf
+        for batch in range(_BATCHES):
+            points = start + self.widths * generator.standard_normal((self.draws, start.size))
+            points[0] = best
+            losses = losses_at(points)
+            samples += self.draws * size_of(self.small)
+            best, first = points[np.argmin(losses)], losses[0] if batch == 0 else first
+            if losses.min() < _BETTER * first:
+                break
+        return best, samples
+
+
+def size_of(problem: ur.Problem) -> int:
+    """Return the number of pixels of all views."""
+    return sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
+
+
 def descend(
-    problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int, evaluations: float = math.inf
+    problem: ur.Problem,
+    estimator: Any,
+    optimizer: Any,
+    seconds: float,
+    seed: int,
+    evaluations: float = math.inf,
+    search: Search | None = None,
 ) -> Descent:
-    """One run of the library's, of so many seconds and `Descent.evaluations` at most, the plan of `auto` not counted in the limit."""
-    size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
-    track = Track(problem, seconds, evaluations * size)
+    """One run of the library's, of so many seconds and `Descent.evaluations` at most, the plan of `auto` not counted in the limit.
+
+    Args:
+        search: what finds the first point, which counts as a step.
+    """
+    size = size_of(problem)
+    track, earlier = Track(problem, seconds, evaluations * size), 0.0
+    if search is not None:
+        search.best(track.points[0], seed)  # compiles
+        began = work_time()
+        point, earlier = search.best(track.points[0], seed)
+        track.clock = work_time() - began
+        track.add(point, track.clock)
+        problem = started_at(problem, point)
     if estimator == "auto":
         method("auto").plan(problem)  # compiles
         began = work_time()
@@ -131,7 +185,13 @@ def descend(
         track.budget += track.clock
     longest = _PATIENCE * min(seconds, _LONGEST)
     ur.optimize(problem, estimator, optimizer, seconds=longest, seed=seed, callbacks=[track])
-    return track.descent(track.samples / size)
+    return track.descent((earlier + track.samples) / size)
+
+
+def started_at(problem: ur.Problem, point: np.ndarray) -> ur.Problem:
+    """Return the problem with other initial values, (n,), flattened in key order."""
+    values = trees.parts(point, problem.initial())
+    return problem.replaced(parameters=[replace(p, initial=values[p.key]) for p in problem.parameters])
 
 
 def truth_of(problem: ur.Problem) -> np.ndarray:

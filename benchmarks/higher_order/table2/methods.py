@@ -145,8 +145,9 @@ def _gauss_newton(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     """Return differences of renders at widths of at most σ, with the mean of all quadratic models as `auto` uses it."""
     largest = {key: task.widths.get(key, task.sigma) for key in task.problem().initial()}
     coarse = c["coarse"] if c["coarse"] > 0.0 else None
-    estimator = ur.GaussNewton(int(c["spp"]), int(c["derivative_spp"]), coarse=coarse, largest=largest)
-    return estimator, ur.optimizers.AveragedNewton(trust_radius=c["radius"])
+    samples = int(c["spp"]), int(c["derivative_spp"])
+    estimator = ur.GaussNewton(*samples, coarse=coarse, largest=largest, scores=False)
+    return estimator, ur.optimizers.AveragedNewton()
 
 
 _NEWTON_GRID = {"half_life": (6.0,), "steps": (30.0,), "radius": (0.5,)}
@@ -162,7 +163,8 @@ METHODS = {
     "OurHVPA": Method(_products(True), {**_KEPT_GRID, "radius": (1.5,), "memory": (0.25, 0.5), **_HALF_OR_ALL}),
     "OurJoint": Method(_joint, {**_KEPT_GRID, "radius": (1.0,), "memory": (0.3, 1.0), **_HALF_OR_ALL}),
     "OurGN": Method(
-        _gauss_newton, {"spp": (8.0, 32.0), "derivative_spp": (2.0, 8.0), "coarse": (4.0, 8.0), "radius": (2.0,)}
+        _gauss_newton,
+        {"draws": (32.0, 64.0), "spread": (0.7, 1.5), "coarse": (4.0, 8.0)} | {"spp": (8.0,), "derivative_spp": (2.0,)},
     ),
 }
 _RATES = {"rate": (0.03, 0.1, 0.3)}

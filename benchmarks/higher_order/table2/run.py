@@ -5,7 +5,7 @@ Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed gradient of Fi
 CMA-ES; L-BFGS on the aggregate gradient; and the paper's: the gradient (OurG) with Adam, the Hessian (OurH) with
 Newton's method, Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG;
 and, beyond the paper, gradient and products from the same renders (OurJoint), Gauss-Newton by differences of renders
-(OurGN), and `auto`, with the time of its plan, which has path gradients on TEXTURE and QUAD, and Gauss-Newton steps on
+after a search (OurGN), and `auto`, with the time of its plan, which has path gradients on TEXTURE and QUAD, and Gauss-Newton steps on
 the others. The others render their perturbations by the same launches, with antithetic draws and shared random numbers,
 and shrink σ as they go. Each but `auto` is tuned on each task over a grid (`methods.py`), on starts of its own, for the
 mean logarithm of its times; then the runs of all methods are done in turns.
@@ -13,6 +13,7 @@ mean logarithm of its times; then the runs of all methods are done in turns.
 
 from __future__ import annotations
 
+import functools
 import math
 import statistics
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.higher_order.table2 import published
-from benchmarks.higher_order.table2.descents import Descent, descend, numbers
+from benchmarks.higher_order.table2.descents import Descent, Search, descend, numbers
 from benchmarks.higher_order.table2.methods import LEFT_OUT, METHODS, Config, configurations
 from benchmarks.higher_order.table2.mitsuba_baseline import MITSUBA, mitsuba
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
@@ -60,7 +61,24 @@ def descend_by(
     if method == "auto":
         return descend(started, "auto", None, task.seconds, number)
     n = sum(value.size for value in problem.truth.values())
-    return descend(started, *METHODS[method].make(task, n, config), task.seconds, number, evaluations)
+    search = searching(task, started, config) if "draws" in config else None
+    return descend(started, *METHODS[method].make(task, n, config), task.seconds, number, evaluations, search)
+
+
+def searching(task: Task, problem: ur.Problem, config: Config) -> Search:
+    """Return the search of a configuration, on a film of half the side."""
+    side = int(problem.renderer.resolutions()[problem.views[0].sensor][0]) // 2
+    small = _small(task.gallery, **{**task.options, "resolution": side})
+    widths = [
+        np.full(value.size, config["spread"] * task.widths.get(key, task.sigma)) for key, value in problem.truth.items()
+    ]
+    return Search(small, np.concatenate(widths), int(config["draws"]))
+
+
+@functools.cache
+def _small(name: str, **options: Any) -> ur.Problem:
+    """Return a problem of the gallery, which compiles once."""
+    return ur.gallery.problem(name, **options)
 
 
 def tune(name: str, task: Task, method: str, problem: ur.Problem) -> tuple[Config, list[dict[str, Any]]]:
