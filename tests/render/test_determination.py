@@ -60,6 +60,8 @@ def test_a_parameter_without_influence_is_named_and_others_are_not():
     seen = {key: np.ones(()) for key in keys[:2]} | {key: np.zeros(()) for key in keys[2:]}
     for most, count in ((0.0, 1), (np.inf, 2)):  # those without a gradient come first
         assert undetermined(made, made.initial_values(), 16, 0.0, most=most, sensitivities=seen) == lines[:count]
+    late = {"most": 1.0, "sensitivities": seen, "path_seconds": 1.0}  # one test would take longer than there is time
+    assert undetermined(made, made.initial_values(), 16, 0.0, **late) == []
 
 
 @pytest.mark.parametrize(

@@ -73,29 +73,29 @@ def undetermined(
     most: float = 0.0,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
     errors: Mapping[str, np.ndarray] = MappingProxyType({}),
+    path_seconds: float = 0.0,
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range, or, without one, from its initial values.
 
-    Parameters without a range are tested if their values have moved far, and have no standard errors.
-
-    Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
-    parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
-    bounds, or its own values if it has none. If they change the images, the line says that only differences of its elements are
-    determined. A map without bounds gets no other line.
+    Parameters without a range are tested if their values have moved far, and have no standard errors. Parameters of materials and media
+    are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a parameter change together. If a map
+    such as a bump map hardly changes the images then, its details are tested: a checkerboard of its bounds, or its own values if it has
+    none. If they change the images, only differences of its elements are determined. A map without bounds gets no other line.
 
     Args:
         values: {key: array}, values of the other parameters.
         spp: samples per pixel of each of four renderings per view.
-        seconds: time after which no further parameter is tested; the first one always is, unless renderings are counted.
+        seconds: time after which no further parameter is tested; the first one always is, unless `path_seconds` says how long it takes.
         per_pass: see `render`.
         most: time limit for parameters whose sensitivity is 0, if it is longer than `seconds`.
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
         errors: {key: array}, standard errors of the values.
+        path_seconds: time of a path; 0 if unknown.
     """
     known, lines, began = problem.renderer.parameters(), [], timing.now()
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
     until = {True: began + max(seconds, most), False: began + seconds}
-    spp, longest = _counted(problem, spp, seconds, per_pass or spp) if timing.counts() else (spp, 0.0)
+    spp, longest = _affordable(problem, spp, seconds, per_pass or spp, path_seconds) if path_seconds else (spp, 0.0)
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
         info, (low, high) = known[key], problem.unknowns[key].bounds
         own, initial = np.asarray(values[key], np.float32), problem.unknowns[key].initial
@@ -126,12 +126,11 @@ def undetermined(
     return lines
 
 
-def _counted(problem: Problem, spp: int, seconds: float, least: int) -> tuple[int, float]:
-    """Return the samples per pixel for which there is time, from `least` to `spp`, and the time of one change of the images with these, if
-    renderings are counted."""
+def _affordable(problem: Problem, spp: int, seconds: float, least: int, path_seconds: float) -> tuple[int, float]:
+    """Return the samples per pixel for which there is time, from `least` to `spp`, and the time of a change of the images with these."""
     paths = _RENDERINGS / 2 * sum(math.prod(problem.sizes[view]) for view in selected_views(problem))
-    spp = max(min(spp, power_of_two(int(seconds / timing.cost(paths)))), min(least, spp))
-    return spp, timing.cost(spp * paths)
+    spp = max(min(spp, power_of_two(int(seconds / (path_seconds * paths)))), min(least, spp))
+    return spp, spp * paths * path_seconds
 
 
 def _moved(initial: np.ndarray, values: np.ndarray) -> bool:

@@ -141,7 +141,7 @@ def render_final_images(
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen, began = _chosen(problem), timing.now()
         pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
-        spent, ends = timing.now() - began, halves_of["result"]
+        spent, ends, paths = timing.now() - began, halves_of["result"], 2 * samples * problem.pixels
         if risen := rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=risen)
         tests = max(left(), 0.0 if timing.counts() else _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
@@ -162,7 +162,7 @@ def render_final_images(
             lines = [*untested_factor(problem), *untested_changes(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
-                problem, result, sensitivities, left, tests, weights, fits=fits, complete=complete
+                problem, result, sensitivities, left, tests, spent / paths, weights, fits=fits, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
@@ -238,6 +238,7 @@ def _undetermined(
     sensitivities: Mapping[str, np.ndarray],
     left: Callable[[], float],
     tests: float,
+    path_seconds: float,
     weights: Sequence[np.ndarray],
     fits: bool,
     complete: bool,
@@ -248,7 +249,7 @@ def _undetermined(
     A final picture that does not fit the references (`fits`) has no standard errors. `complete`: see `render_final_images`.
 
     Of `tests` seconds, a test takes at most about a quarter, unless renderings are counted: tests then take what is `left`, the most
-    telling ones first.
+    telling ones first. A path takes `path_seconds`.
     """
     if not result.steps:
         return [], (), {}, []
@@ -270,7 +271,7 @@ def _undetermined(
     numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights)
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
-    limits = within(seconds), per_pass, within(most), sensitivities, deviations
+    limits = within(seconds), per_pass, within(most), sensitivities, deviations, path_seconds
     lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)

@@ -54,6 +54,7 @@ class Run:
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
             covers the steps only.
         compiled: whether the warm-up has added kernels to the cache.
+        tested: whether the budget has time for tests at the end, whose kernels the warm-up has then compiled.
     """
 
     plan: Plan
@@ -82,6 +83,7 @@ class Run:
     last_step: float | None = None
     deadline: float | None = None
     compiled: bool = False
+    tested: bool = True
 
     def begin_budget(self, began: float | None) -> None:
         """Set the deadline of a budget in seconds that counts from `began`; None for one that covers the steps alone."""

@@ -64,8 +64,8 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
-_FIRST_EARLIER, _COST = 4, 0.014
-"""Step from which images of earlier steps are taken for short runs, if their paths are at most this fraction of the steps' paths."""
+_FIRST_EARLIER, _COST, _OF_TRUTH = 4, 0.014, 8.0
+"""First step with an image for short runs, largest share of these in the steps' paths, and time of a check against the truth, in steps."""
 _SMALL, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
 
@@ -155,7 +155,8 @@ class Verify(Callback):
             result = replace(result, standard_error={})
         lines = [differs.line] if differs else []
         few = has_few_steps(result.steps, run.optimizer)
-        if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
+        known = problem.has_truth and run.tested and run.time_left() > _OF_TRUTH * run.clock / result.steps
+        if known and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             errors = {} if places else result.standard_error
             lines += further_from_truth(problem, pictures, result.initial, ends, few, seconds_of_steps(result), errors)

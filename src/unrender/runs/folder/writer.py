@@ -109,7 +109,6 @@ class RunWriter(Callback):
     _written_at: float = field(default_factory=time.perf_counter)
     _cost: float = 0.0
     _thin_from: int = 0
-    _tested: bool = True
 
     def __post_init__(self) -> None:
         self._lock = Lock(self.folder)
@@ -162,11 +161,11 @@ class RunWriter(Callback):
         """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
         if self.final_spp != 1 and not run.stopped:
             share = _TESTED_SHARE[run.compiled]
-            self._tested = run.seconds is None or run.time_left() > share * run.seconds
+            run.tested = run.seconds is None or run.time_left() > share * run.seconds
             with phases.phase(callbacks.COMPILING):
                 steps = run.steps or 0
                 counted = math.inf if run.seconds else cost_of_end(steps * warm["samples"] / WARM_UP_STEPS, steps)
-                warm_up(run.problem, run.full(), self._tested, counted)
+                warm_up(run.problem, run.full(), run.tested, counted)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         self.append(record)
@@ -192,7 +191,7 @@ class RunWriter(Callback):
             def left() -> float:
                 return run.time_left() if run.seconds is not None else allowed - timing.now()
 
-            given = self.final_spp, left, self._tested, result.pixel_weights, complete
+            given = self.final_spp, left, run.tested, result.pixel_weights, complete
             with timing.counting(run.seconds is None):
                 images = render_final_images(run.problem, result, *given)
                 if images.rise:
