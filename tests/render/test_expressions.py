@@ -69,6 +69,7 @@ def problem(
         ("a ** 2 - b / 4", [1 - 0.75, 4 - 0.75]),
         ("-a[1] + [1, 2] + b ** 0.5 * 0", [-1.0, 0.0]),
         ("(a * a) ** 0.25 - b ** 0.75 * 0", [1.0, 2**0.5]),
+        ("(a - 1) ** (b / 3) + a ** [2, 0.5] - 2 ** b / 8", [0.0, 2**0.5]),
         ("exp(log(a)) + sqrt(b) * 0", [1.0, 2.0]),
         ("max(a, 1.5) + min(b, 2)", [3.5, 4.0]),
         ("mix(a, b, 0.25) + abs(sin(0)) + cos(0) - 1 + tanh(0)", [1.5, 2.25]),
@@ -334,6 +335,10 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"expression": "(strength - 1) ** 0.5"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.3"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.75"}, r"its derivative by strength is not finite at the initial values"),
+        (
+            {"expression": "(strength - 1) ** (strength / 2)"},
+            r"its derivative by strength is not finite at the initial",
+        ),
         ({"expression": "strength * [1, 2]"}, r"has the shape \(2,\), lamp.intensity.value has \(3,\)"),
         ({"key": "lamp.colour"}, r"the scene has no parameter lamp.colour"),
         ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs an initial value"),

@@ -259,21 +259,23 @@ def test_places_of_a_shape_share_launches(shape: tuple[int, int], views: int, mo
 
 
 @pytest.mark.parametrize(
-    ("other", "light", "told"),
+    ("other", "light", "bounds", "told"),
     [
-        ("fill.rotation.x", 1.0, True),
-        ("fill.rotation.x", 2.0, False),
-        ("fill.rotation.y", 1.0, False),
-        ("lamp.rotation.y", 1.0, False),
-        ("box.rotation.x", 1.0, False),
-        ("fill.position", 1.0, True),
-        ("fill.position", 2.0, False),
+        ("fill.rotation.x", 1.0, (None, None), True),
+        ("fill.rotation.x", 2.0, (None, None), False),
+        ("fill.rotation.y", 1.0, (None, None), False),
+        ("lamp.rotation.y", 1.0, (None, None), False),
+        ("box.rotation.x", 1.0, (None, None), False),
+        ("fill.position", 1.0, (None, None), True),
+        ("fill.position", 1.0, (-1.0, 2.0), True),
+        ("fill.position", 1.0, (-1.0, 0.5), False),
+        ("fill.position", 2.0, (None, None), False),
     ],
 )
 def test_lights_that_may_be_exchanged_have_a_line(
-    other: str, light: float, told: bool, monkeypatch: pytest.MonkeyPatch
+    other: str, light: float, bounds: tuple[float | None, float | None], told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Lights of other colours, other unknown coordinates, or a single one, are not exchanged."""
+    """Lights of other colours, other unknown coordinates, bounds without a common value, or a single one, are not exchanged."""
     values = {"lamp.intensity": np.ones(1), "fill.intensity": np.full(1, light)}
     poses = {f"{name}.rotation.{axis}": np.zeros(1) for name in ("lamp", "fill", "box") for axis in "xy"}
     poses |= {f"{name}.position": np.zeros(1) for name in ("lamp", "fill")}
@@ -285,6 +287,7 @@ def test_lights_that_may_be_exchanged_have_a_line(
         for key, info in renderer.parameters().items()
     }
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
-    unknown = [Parameter(other.replace("fill", "lamp") if "position" in other else "lamp.rotation.x"), Parameter(other)]
+    first = Parameter(other.replace("fill", "lamp"), bounds=(1.0, 3.0), initial=2.0)
+    unknown = [first if "position" in other else Parameter("lamp.rotation.x"), Parameter(other, bounds=bounds)]
     scene = Problem(renderer, unknown, [View(np.zeros((4, 4, 3)))])
     assert starts.exchangeable_lights(scene) == (["lamp", "fill"] if told else [])

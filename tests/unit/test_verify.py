@@ -785,6 +785,27 @@ def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds
         assert verification.misfit_of_views(problem, [0], [[image + 0.1 for image in images]])
 
 
+@pytest.mark.parametrize("place", ["top row", "bottom row", "left column", "right column", ""])
+@pytest.mark.parametrize("side", [16, 24])
+def test_a_wrong_line_of_pixels_at_the_border_of_a_reference_is_told(place: str, side: int) -> None:
+    """A pose had followed a reference that was shifted by a pixel, to 110 of its standard errors, and only the border did not fit.
+
+    The left column has more noise, which is no difference.
+    """
+    y, x = np.mgrid[:side, :side]
+    light, generator = np.repeat((1.0 + 0.3 * (x + y) / side)[..., None], 3, axis=2), np.random.default_rng(side)
+    scale = 0.02 * np.where(x == 0, 4.0 if place else 10.0, 1.0)[..., None]
+    reference = light + scale * generator.standard_t(3.0, light.shape)
+    if place:
+        line = 0 if place.startswith(("top", "left")) else -1
+        reference.swapaxes(0, int(place.endswith("column")))[line] = 0.5
+    images = [light + scale * generator.normal(size=light.shape) for _ in range(2)]
+    one, other = ((image - reference).reshape(1, -1, 3) for image in images)
+    found = verification.misfit(one, other, light.reshape(-1, 3), np.ones(side * side), [(side, side)], 0.01)
+    assert (found is not None and f"in its {place} of pixels" in found.line) is bool(place)
+    assert bool(place) or found is None
+
+
 def brighter(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """A picture twice as bright."""
     return 2.0 * light + generator.normal(0.0, 0.01, light.shape)

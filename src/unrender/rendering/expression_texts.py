@@ -31,8 +31,11 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 
 
 def _power(a: Any, b: Any) -> Any:
-    """Return a ** b. For numbers b between 0 and 1 the derivative at 0 is infinite, where Dr.Jit's is 0."""
-    return dr.select(a == 0.0, dr.sqrt(a), a**b) if isinstance(b, float) and 0.0 < b < 1.0 else a**b
+    """Return a ** b. For b up to 1 the derivative by a at 0 is infinite or 1, where Dr.Jit's is 0."""
+    if isinstance(b, float) and not 0.0 < b < 1.0:
+        return a**b
+    root, line = (a == 0.0) & (b > 0.0) & (b < 1.0), (a == 0.0) & (b == 1.0)
+    return dr.select(root, dr.sqrt(dr.select(root, a, 1.0)), dr.select(line, a, a**b))
 
 
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {

@@ -235,9 +235,9 @@ def unexplained_pixels(
     if differs is None or (problem.has_prior and differs.share * everywhere < _MOSTLY * total):
         return None
     cause = cause if shared > _MOSTLY * differs.error else ""
-    share = np.count_nonzero(little * weights) / np.count_nonzero(weights)
+    share, where = np.count_nonzero(little * weights) / np.count_nonzero(weights), ", among" if differs.place else " in"
     explanation = (
-        f" in the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, alignment or "
+        f"{where} the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, alignment or "
         "something else that is not among the unknowns is wrong"
     )
     return replace(differs, size=max(size, everywhere), explanation=explanation, causes=(STEPS,) if moves else ())

@@ -30,7 +30,6 @@ LOST = "lost"
 OF_FUNCTION = "the loss is a function of your own, whose minimum may differ from the references"
 """Reason for no standard errors with a `FunctionLoss`."""
 _OF_PRIOR = "a prior may be too strong, or "
-"""Words about this cause."""
 _OF_MODEL = 0.25
 """Smallest difference relative to the picture that ends a run without a known truth as "does not fit". References such as photographs
 differ from any model: an asset from rendered photographs and a carved mesh by 13 %."""
@@ -45,8 +44,7 @@ _SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 """Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
 
-_ROWS, _PAIRS = (3, 1), (1, 0)
-"""Layout for `paired_losses.systematic` of rows of pixels, and of pairs of a sample."""
+_ROWS, _PAIRS = (3, 1), (1, 0)  # layouts for `paired_losses.systematic` of rows of pixels, and of pairs of a sample
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
 _OF_TRUTH = 4.0
@@ -66,6 +64,7 @@ class Misfit:
         by_pixel: whether pixels were judged one by one, so that the references' noise may be part of the difference.
         explanation: rest of the warning, after `describe`.
         causes: likely causes: `STEPS`, `STEPS_OF_FEW`, `PRIOR`, `NOISE`, `LOST`; () for something that is not among the unknowns.
+        place: words about the pixels that hold it; "" for all.
     """
 
     error: float
@@ -74,6 +73,7 @@ class Misfit:
     by_pixel: bool = False
     explanation: str = ""
     causes: tuple[str, ...] = ()
+    place: str = ""
 
     @property
     def share(self) -> float:
@@ -86,11 +86,8 @@ class Misfit:
         return self.describe() + self.explanation
 
     def is_references_noise(self, at_truth: Callable[[], float] | None) -> bool:
-        """Return whether the references' noise may explain a difference that was judged pixel by pixel.
-
-        Args:
-            at_truth: function that returns the mean square difference of pictures of the true values; None if these are unknown.
-        """
+        """Return whether the references' noise may explain a difference that was judged pixel by pixel. `at_truth` returns the mean square
+        difference of pictures of the true values; None if these are unknown."""
         return self.by_pixel and at_truth is not None and self.error**2 <= _OF_TRUTH * at_truth()
 
     def record(self) -> dict[str, Any]:
@@ -102,8 +99,8 @@ class Misfit:
         """Return the first words of a warning, with the ratio to the noise where it is above 1."""
         times = f"{self.error / self.noise:.1f} times its noise" if 0.0 < self.noise < self.error else ""
         share = f"{self.share:.0%} of the picture" if self.size > 0.0 else ""
-        parts = ", ".join(filter(None, (share, times)))
-        return f"{DIFFERS} by {formatting.number(self.error)}" + (f" ({parts})" if parts else "")
+        parts = f" ({', '.join(filter(None, (share, times)))})" * bool(share or times)
+        return f"{DIFFERS} by {formatting.number(self.error)}{parts}{self.place}"
 
 
 def misfit(
@@ -137,15 +134,21 @@ def misfit(
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     size, total = (math.sqrt(paired_losses.mean_square(x, weights)) for x in (references, one))
 
-    def significant(shared: paired_losses.SystematicDifference, smallest: float, one_by_one: bool) -> Misfit | None:
+    def significant(
+        shared: paired_losses.SystematicDifference, smallest: float, one_by_one: bool, place: str = ""
+    ) -> Misfit | None:
         error = math.sqrt(max(shared.mean_square, 0.0))
-        beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
-        return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), one_by_one) if beyond else None
+        if not (shared.score > paired_losses.SIGNIFICANT and error > smallest * size):
+            return None
+        return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), one_by_one, place=place)
 
     tiles = paired_losses.systematic(one, weights, other, _ROWS if sizes else _PAIRS)
     edges = (paired_losses.nearby(one, weights, sizes, axes, other) for axes in ((0,), (1,), (0, 1)))
     scales = (significant(part, least, False) for part in (tiles, *edges))
     difference = max(filter(None, scales), key=lambda found: found.error, default=None)
+    if difference is None:
+        line, place = paired_losses.at_border(one, other, weights, sizes)
+        difference = significant(line, least, False, place)
     if difference is None and halves is not None and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
         difference = significant(paired_losses.repeated(parts[0], parts[1], weights), _OF_FEW, True)
     if difference is None and by_pixel:
@@ -320,9 +323,8 @@ def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) ->
     joined = np.concatenate(images, axis=1)[:, weights > 0].sum(axis=2)
     joined = joined[:, np.isfinite(joined).all(axis=0)]
     joined /= max(float(np.abs(joined).max(initial=0.0)), 1e-300)  # squares of the largest numbers overflow
-    count = len(joined)
     variances = joined.var(axis=0, ddof=1)
-    squares = np.square(joined.mean(axis=0)) - variances / count
+    squares = np.square(joined.mean(axis=0)) - variances / len(joined)
     most = float(squares.sum()) + _ERRORS * math.sqrt(float(np.square(squares).sum()))
     paths = 1.0 + spp * float(variances.sum()) / max(most, 1e-300)
     if not most > 0.0 or paths < _RARE:
@@ -372,13 +374,13 @@ def compare_memory(
     if not np.isfinite(differences[finite]).all():
         return Memory(math.inf, 0.0, 0.0, math.inf)
     shared = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
-    total = max(float((weights * finite).sum()) * 3, 1e-300)
+    counted = (weights * finite)[:, None]
 
     def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
         joined = np.concatenate(images, axis=1)
         one, other = joined[0::2].mean(axis=0) - subtracted, joined[1::2].mean(axis=0) - subtracted
-        products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
-        return math.sqrt(max(float(products.sum()) / total, 0.0))
+        products = np.where(np.isfinite(one * other), one * other, 0.0) * counted
+        return math.sqrt(max(float(products.sum()) / max(3 * float(counted.sum()), 1e-300), 0.0))
 
     error = math.sqrt(max(shared.mean_square, 0.0))
     return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)

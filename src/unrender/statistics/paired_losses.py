@@ -18,6 +18,9 @@ that of independent products. Mitsuba's default filter, a Gaussian, leaves exp(-
 _OF_NOISE, _LEVEL = 4.0, 1e-5
 """Smallest mean square of a difference in few pixels, relative to the reference's noise as the other pixels suggest it; false positive
 rate of its test."""
+_BESIDE, _ALONG, _LEAST_SIDE = 4, 2.0, 12
+"""Number of lines of pixels, from the third on, to which a picture's outermost line is compared; score of the products along it from which
+its pixels agree; fewest pixels of a side."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,39 @@ def concentrated(
     # Two pictures tell the noise of a pixel with one degree of freedom.
     needed = Difference(1.0, 1.0, float(products.sum() ** 2 / np.square(products).sum())).quantile(_LEVEL)
     return SystematicDifference(square, SIGNIFICANT * total / (needed * error) if error > 0 else math.inf)
+
+
+def at_border(
+    one: np.ndarray, other: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]
+) -> tuple[SystematicDifference, str]:
+    """Return the part of two pictures' differences from one reference that both share in an outermost line of pixels, and which line it is.
+
+    A frame or padding of the reference leaves such a difference, as does a shift that wraps around. It is too small a part of the picture
+    for `nearby`. Its products at a distance of 2 must agree along the line. Their sum must be four times the sum of squares of each line
+    beside it, and of the reference's noise in the line, as those lines and the pictures' noise suggest it. Otherwise the score is 0.
+
+    Args:
+        one, other: differences of two independent pictures, (N, C).
+        weights, sizes: see `nearby`.
+    """
+    one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
+    most, place = 0.0, ""
+    for part, size in zip(slices_of_images(sizes), sizes, strict=True):
+        for axis, names in enumerate((("top row", "bottom row"), ("left column", "right column"))):
+            for name, turned in zip(names, (slice(None), slice(None, None, -1)), strict=True):
+                a, b = (of[part].reshape(*size, -1).swapaxes(0, axis)[turned] for of in (one, other))
+                if min(size) < _LEAST_SIDE:
+                    continue
+                lines = [0, *range(DISTANCE, DISTANCE + _BESIDE)]
+                shared, noise = (x[lines].sum(axis=(1, 2)) for x in (a * b, np.square(a - b) / 2))
+                along = 0.5 * (a[0, :-DISTANCE] * b[0, DISTANCE:] + b[0, :-DISTANCE] * a[0, DISTANCE:]).sum(axis=1)
+                total, deviation = float(along.sum()), _OF_PRODUCTS * math.sqrt(float(np.square(along).sum()))
+                expected = float(np.median(shared[1:] / np.maximum(noise[1:], 1e-300)) * noise[0])
+                beyond = total > _OF_NOISE * max(float(shared[1:].max()), expected)
+                if beyond and total > _ALONG * deviation and shared[0] > most:
+                    most, place = float(shared[0]), f" in its {name} of pixels"
+    square = most / max(float(weights.sum()) * one.shape[1], 1e-300)
+    return SystematicDifference(square, math.inf if most else 0.0), place
 
 
 def systematic(

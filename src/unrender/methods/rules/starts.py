@@ -146,7 +146,17 @@ def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]
     pairs = [(one + part, other + part) for part in counted if not part.endswith(_NORMALS)]
     fixed = [pair for pair in pairs if not any(key in problem.shapes() for key in pair)]
     values = problem.renderer.values([key for pair in fixed for key in pair])
-    return all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed)
+    if not all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed):
+        return False
+    unknown = [(one + part, other + part) for part in (*counted, *moved[one]) if not infos[one + part].rigid]
+    return all(_overlap(problem, pair) for pair in unknown if all(key in problem.unknowns for key in pair))
+
+
+def _overlap(problem: Problem, keys: Sequence[str]) -> bool:
+    """Return whether the bounds of unknowns leave values that all may have."""
+    lows, highs = zip(*(problem.unknowns[key].bounds for key in keys), strict=True)
+    ends = (max(x for x in (*lows, -math.inf) if x is not None), min(x for x in (*highs, math.inf) if x is not None))
+    return ends[0] <= ends[1]
 
 
 def _equal(one: np.ndarray, other: np.ndarray, vertices: bool) -> bool:
