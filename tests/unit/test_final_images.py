@@ -228,6 +228,14 @@ def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: p
     assert "it moves" in found.warnings
     assert found.misfit is not None
     assert "hence no standard errors" in found.misfit.line
+    # A distortion of the references is named in one line.
+    words = "as if the reference of view 0 were shifted"
+    check = replace(check, undetermined={}, distorted=f"the pictures differ {words}")
+    assert check.distorted in final_images.render_final_images(made, result).undetermined
+    same = replace(found.misfit, explanation=f", {words}")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: same)
+    assert not final_images.render_final_images(made, result).undetermined
+    check = least_squares.NumbersCheck({"wall": "the references leave it open"})
     monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: None)
     assert "the references leave it open" in final_images.render_final_images(made, result).undetermined
 

@@ -14,7 +14,7 @@ from unrender.estimators.penalties import penalty
 from unrender.runs.determination import changed
 from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
 from unrender.runs.folder.schema import MISFIT
-from unrender.runs.reference_distortions import distortions
+from unrender.runs.reference_distortions import AS_IF, distortions
 from unrender.runs.result import Result
 from unrender.runs.verification import (
     PRIOR,
@@ -237,8 +237,8 @@ def unexplained_pixels(
     cause = cause if shared > _MOSTLY * differs.error else ""
     share, where = np.count_nonzero(little * weights) / np.count_nonzero(weights), ", among" if differs.place else " in"
     explanation = (
-        f"{where} the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, alignment or "
-        "something else that is not among the unknowns is wrong"
+        f"{where} the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, "
+        "alignment or something else that is not among the unknowns is wrong"
     )
     return replace(differs, size=max(size, everywhere), explanation=explanation, causes=(STEPS,) if moves else ())
 
@@ -338,7 +338,7 @@ def _as_if(
                 best, shared, sure = name, fitted, index > 0
         if best:
             alone = explained.pop(best) > _DISTINCT * max(explained.values())
-            cause = f", as if the reference of view {view} {best}" if alone else ""
+            cause = f", {AS_IF} {view} {best}" if alone else ""
     return cause, shared, sure
 
 

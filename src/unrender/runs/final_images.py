@@ -35,6 +35,7 @@ from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_key
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
+from unrender.runs.reference_distortions import AS_IF
 from unrender.runs.result import Result
 from unrender.runs.verification import DIFFERS, NOISE, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
@@ -50,9 +51,7 @@ _SENSITIVITY_SHARE = 0.5
 """Additional time limit of the sensitivity relative to that; it takes at least one probe."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 """Time limit of each of two tests of undetermined parameters relative to the time of the steps, and its minimum in seconds."""
-_LEAST_COUNTED = (
-    0.1  # time limit of each test of undetermined parameters if renderings are counted, even if no time is left
-)
+_LEAST_COUNTED = 0.1  # time limit of each such test if renderings are counted, even if no time is left
 _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE, _NUMBERS_COUNTED = 0.05, 2.0
@@ -173,8 +172,13 @@ def render_final_images(
     deviations = {**deviations, **maps.standard_error} if fits else {}
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
-    texts, errors_of = (*lines, *maps.limited), (deviations, maps.data_share, maps.missing)
+    texts, errors_of = (*_named_once(lines, differs), *maps.limited), (deviations, maps.data_share, maps.missing)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
+
+
+def _named_once(lines: Sequence[str], differs: Misfit | None) -> list[str]:
+    """Return lines without those about a distortion of the references, if the difference names one."""
+    return [line for line in lines if not (differs and AS_IF in differs.line and AS_IF in line)]
 
 
 def at_start(result: Result, rise: str) -> Result:

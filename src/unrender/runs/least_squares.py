@@ -36,13 +36,11 @@ _PASSES, _REPEATS, _CHANGES = 3, 8, (64.0, 8.0, 4.0)
 """Passes that find widths, most repeats of the pictures that are judged, and the factors by which widths change at most."""
 _FIRST_WIDTH, _SHIFT = 0.02, 0.3
 """First widths of differences, relative to their limits; shift of the picture, in pixels, that a difference is as large as."""
-_WEAKEST = 1e-4
-"""Smallest eigenvalue, relative to the largest, that the length of a direction follows."""
+_WEAKEST = 1e-4  # smallest eigenvalue, relative to the largest, that the length of a direction follows
 _FLAT, _COMPARABLE = 0.1, 0.3
 """Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined;
 noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
-_CHANNELS = 3.0
-"""Channels that share their noise."""
+_CHANNELS = 3.0  # channels that share their noise
 _ERRORS, _ROUNDING = 3.0, 1e-10
 """Standard errors by which the change along a direction must exceed its noise; square of one, relative to the largest, left by rounding."""
 _DOUBTFUL = 0.1  # standard error, as a share of a number's size, from which on it is undetermined
@@ -51,8 +49,7 @@ _OF_WIDTHS, _TOGETHER = 10.0, 0.9
 """Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
 """Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
-_DISTORTED = 2.0
-"""Standard errors by which a distortion of the references must move a number, if it is the reason for no standard errors."""
+_DISTORTED = 2.0  # standard errors by which a distortion of the references must move a number that has none then
 _FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
 """Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
 the noisiest pixels that may hide it."""
@@ -230,7 +227,7 @@ class _Fit:
         own: the same from the noise of this check, its slopes included, (n,).
         step: step of the numbers, (n,).
         unseen: largest changes of the numbers along each hidden direction that leaves them open, signed, (n, number of hidden directions).
-        blind: largest changes of the numbers along the other hidden directions, whose slopes this check does not know, (n,).
+        blind: largest changes of the numbers along the other hidden directions, of whose slopes this check knows upper limits, (n,).
         better: standard errors by which the picture is better than with the start's numbers.
         beyond: distance of the solution beyond a bound of the number, (n,); 0 where noise may explain it.
         distortion: what a reference looks like, see `distortion_of_fit`; "" for nothing.
@@ -320,7 +317,7 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # uncertainty shared with undetermined numbers
     error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
     n, spread = numbers.count, np.outer(fit.error, fit.error)
-    # An open number may be anywhere in its range. Numbers that trade off against it move along, beyond their own errors.
+    # An open number may be anywhere in its range, and numbers that trade off against it move along.
     total = np.nan_to_num(fit.covariance[:n, :n], posinf=0.0, neginf=0.0) + fit.unseen @ fit.unseen.T
     along = np.where(error > sizes, np.abs(total) / np.maximum(np.diag(total), 1e-300) * longest, 0.0)
     error = np.maximum(error, along.max(axis=1))
@@ -328,7 +325,6 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    # A hidden slope has an upper limit alone, so an error from it is a lower limit.
     own = np.where(blind := fit.blind > np.maximum(error, fit.own), np.inf, fit.own)
     of_step = np.maximum(error, own)  # references without noise leave the noise of this check
     far = np.abs(fit.step) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
@@ -352,13 +348,12 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
             )
         elif open_[of].any():
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
-            others += [*numbers.fields] if shared[of].any() else []
+            others += [*numbers.fields] * bool(shared[of].any())
             together_with = f", together with {listed(others)}" if others else ""
-            limit = f"determines it to ± {_numbers(shown[of])}{more}"
-            found = limit if (error <= sizes)[of].any() else "does not determine it"
+            limit = f"determines it to ± {_numbers(shown[of])}{more}" if (error <= sizes)[of].any() else ""
             undetermined[key] = (
-                f"{key}: a least-squares test at the end {found}{together_with} (with the noise of the references and of the test); fix "
-                "one of these, add views or samples, or narrow the bounds"
+                f"{key}: a least-squares test at the end {limit or 'does not determine it'}{together_with} (with the noise of the "
+                "references and of the test); fix one of these, add views or samples, or narrow the bounds"
             )
         elif further[of].any() and numbers.problem.loss.linear:
             unfinished[key] = (
@@ -370,7 +365,9 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
     if line := _distorted(numbers, fit, of_step, bool((further | refuted).any())):
-        return NumbersCheck({}, unfinished, {}, steps, noise, numbers.keys, distorted=line)
+        sure = refuted | unseen.any(axis=1) | (fit.own > sizes)  # its residual leaves other numbers open
+        undetermined = {key: text for key, text in undetermined.items() if sure[numbers.places()[key]].any()}
+        return NumbersCheck(undetermined, unfinished, {}, steps, noise, numbers.keys, distorted=line)
     return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
 
 
@@ -384,7 +381,7 @@ def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, unsettled: bool
         if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
     ]
     line = (
-        f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references as if {fit.distortion}, which would move "
+        f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references {fit.distortion}, which would move "
         f"{listed(moved)}; {'give more steps or another start, then ' * unsettled}check the references and the camera"
     )
     return line if moved else ""

@@ -14,6 +14,8 @@ from unrender.statistics.paired_losses import slices_of_images
 if TYPE_CHECKING:
     from unrender.runs.numbers import Numbers
 
+AS_IF = "as if the reference of view"
+"""Words before a view and what its reference looks like."""
 _EQUAL, _PLATEAU = 1e-3, 16
 """Relative difference of values that count as equal, and fewest values equal to the largest of a reference that is saturated."""
 _SURE, _OWN, _LEAST_SIDE = 6.0, 0.05, 8
@@ -89,5 +91,5 @@ def distortion_of_fit(
             errors = np.sqrt(np.maximum(np.diag(np.linalg.solve(matrix, np.linalg.solve(matrix, middle).T)), 0.0))
             explained = float(amounts @ matrix @ amounts)
             if explained > most and (np.abs(amounts) > _SURE * errors).any():
-                words, moves, most = f"the reference of view {view} {describe(amounts)}", gains @ amounts, explained
+                words, moves, most = f"{AS_IF} {view} {describe(amounts)}", gains @ amounts, explained
     return words, moves

@@ -31,8 +31,7 @@ OF_FUNCTION = "the loss is a function of your own, whose minimum may differ from
 """Reason for no standard errors with a `FunctionLoss`."""
 _OF_PRIOR = "a prior may be too strong, or "
 _OF_MODEL = 0.25
-"""Smallest difference relative to the picture that ends a run without a known truth as "does not fit". References such as photographs
-differ from any model: an asset from rendered photographs and a carved mesh by 13 %."""
+"""Smallest difference relative to the picture that ends a run without a known truth as "does not fit"; photographs differ by 13 %."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
@@ -47,8 +46,7 @@ image; that in runs of less than about 100 steps; score of the product of two pi
 _ROWS, _PAIRS = (3, 1), (1, 0)  # layouts for `paired_losses.systematic` of rows of pixels, and of pairs of a sample
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
-_OF_TRUTH = 4.0
-"""Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
+_OF_TRUTH = 4.0  # least mean square of a residual judged pixel by pixel, relative to that at known true values
 _OF_RESIDUAL, _OF_SEEN = 0.1, 0.02
 """Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
 

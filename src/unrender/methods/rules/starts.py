@@ -24,23 +24,18 @@ from unrender.statistics.paired_losses import difference, mean_and_error
 
 _PER_DIMENSION, _MOST_PLACES, _MOST_POSES = 16, 24, 48
 """Number of compared places per dimension, and maximum number in all dimensions together; the latter for the pose of a shape."""
-_NEAR = 16
-"""Number of places around the best pose of a shape."""
-_FAR = 4.0
-"""Largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)."""
-_PATHS, _NUMBER = 1 << 15, 3
-"""Paths of one picture, and index of their random numbers."""
+_NEAR = 16  # number of places around the best pose of a shape
+_FAR = 4.0  # largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)
+_PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
 _MOTIONS = ("translation", "rotation", "scale")
 """Parts of the keys of poses, after the name of what they move."""
-_POSITION = "position"
-"""Last part of the keys of positions of lights without a pose."""
+_POSITION = "position"  # last part of the keys of positions of lights without a pose
 _NORMALS, _TRANSFORM, _ROUNDING = "_normals", "to_", 1e-4
 """Last part of the keys of normals, and its beginning for transforms, which are not compared; largest difference of equal positions,
 relative to a shape's size."""
-_FACTORS = (1e-2, 1e2)
-"""Limits of the common factor of lights in a comparison, within their bounds."""
+_FACTORS = (1e-2, 1e2)  # limits of the common factor of lights in a comparison, within their bounds
 
 
 @dataclass(frozen=True)
@@ -148,15 +143,9 @@ def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]
     values = problem.renderer.values([key for pair in fixed for key in pair])
     if not all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed):
         return False
-    unknown = [(one + part, other + part) for part in (*counted, *moved[one]) if not infos[one + part].rigid]
-    return all(_overlap(problem, pair) for pair in unknown if all(key in problem.unknowns for key in pair))
-
-
-def _overlap(problem: Problem, keys: Sequence[str]) -> bool:
-    """Return whether the bounds of unknowns leave values that all may have."""
-    lows, highs = zip(*(problem.unknowns[key].bounds for key in keys), strict=True)
-    ends = (max(x for x in (*lows, -math.inf) if x is not None), min(x for x in (*highs, math.inf) if x is not None))
-    return ends[0] <= ends[1]
+    known = {key: _ends(unknown.bounds) for key, unknown in problem.unknowns.items() if not infos[key].rigid}
+    both = [(known[one + x], known[other + x]) for x in (*counted, *moved[one]) if {one + x, other + x} <= known.keys()]
+    return all(max(a[0], b[0]) <= min(a[1], b[1]) for a, b in both)  # bounds with a common value
 
 
 def _equal(one: np.ndarray, other: np.ndarray, vertices: bool) -> bool:
@@ -387,14 +376,16 @@ def _value(problem: Problem, key: str, point: np.ndarray, around: np.ndarray) ->
     return np.asarray(unknown.project(value), np.float32)
 
 
+def _ends(bounds: Bounds) -> tuple[float, float]:
+    return -math.inf if bounds[0] is None else bounds[0], math.inf if bounds[1] is None else bounds[1]
+
+
 def _limits(lights: Sequence[tuple[np.ndarray, Bounds]]) -> Bounds:
     """Return the limits of a common factor of values with bounds; 1 is within them."""
     low, high = _FACTORS
     for values, bounds in lights:
         x = np.ravel(values).astype(np.float64)
-        below, above = (
-            default if end is None else end for end, default in zip(bounds, (-math.inf, math.inf), strict=True)
-        )
+        below, above = _ends(bounds)
         ends = np.sort([below / x[x != 0.0], above / x[x != 0.0]], axis=0)
         low, high = float(ends[0].max(initial=low)), float(ends[1].min(initial=high))
     return min(low, 1.0), max(high, 1.0)
