@@ -705,7 +705,7 @@ def test_means_of_models_of_other_losses_average_noise(loss: Any) -> None:
     """The gradient's noise is known to a factor of two; by that of derivative images alone it would be a thirtieth. Without it, models
     would be forgotten as those of another scene."""
     made, estimator = problem(loss), ur.GaussNewton(16, 16)
-    state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+    _, state = estimator.estimate(made, START, module.GaussNewtonState({"a": 0.02, "b": 0.03}), Key(1000))
     found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(100)]
     gradients = np.stack([np.concatenate([one.gradient[key] for key in START]) for one in found])
     told = np.mean([np.diag(one.require("test", GradientNoise).matrix) for one in found], axis=0)
@@ -716,6 +716,27 @@ def test_means_of_models_of_other_losses_average_noise(loss: Any) -> None:
     errors = {key: result.parameters[key] - TRUTH[key] for key in TRUTH}
     assert max(np.abs(error).max() for error in errors.values()) < 0.01
     assert all((np.abs(error) < 5.0 * result.standard_error[key]).all() for key, error in errors.items())
+
+
+def test_skewed_noise_does_not_bias_other_losses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exponential noise of the image: the mean gradient at the truth, of positive derivatives, is 0 within 4.5 standard errors."""
+    states = system.Point._states
+
+    def bright(point: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        images = states(point, points, view, key, spp)
+        noise = np.random.default_rng(key.uint32()).exponential(0.5, images.shape[1:]) - 0.5
+        return images + noise if len(points) == 1 else images
+
+    monkeypatch.setattr(system.Point, "_states", bright)
+    renderer = AnalyticRenderer(TRUTH, np.abs(MATRIX), 0.1, 0.0, shape=(4, 5))
+    unknown = [ur.Parameter(key, initial=value) for key, value in TRUTH.items()]
+    made = ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], ur.losses.L1(), truth=TRUTH)
+    estimator, state, found = ur.GaussNewton(2, 2), module.GaussNewtonState({"a": 0.02, "b": 0.03}), []
+    for seed in range(220):
+        estimate, state = estimator.estimate(made, TRUTH, state, Key(seed))
+        found.append(np.concatenate([estimate.gradient[key] for key in TRUTH]))
+    gradients = np.stack(found[20:])
+    assert (np.abs(gradients.mean(axis=0)) < 4.5 * gradients.std(axis=0, ddof=1) / np.sqrt(len(gradients))).all()
 
 
 @pytest.mark.parametrize("remember", quick([True, False], True))

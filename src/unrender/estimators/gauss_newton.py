@@ -64,6 +64,7 @@ class GaussNewtonState:
         origin: parameters of the last derivative images, (n,); None before the first estimate.
         noise: noise of the mean derivative images relative to the derivatives, averaged over directions.
         differenced: widths with which the mean derivative images began; {} before the first estimate.
+        pictures: mean image of each view; () for losses whose derivative is linear, and before the first estimate.
     """
 
     widths: dict[str, float]
@@ -77,6 +78,7 @@ class GaussNewtonState:
     origin: np.ndarray | None = None
     noise: float = 0.0
     differenced: dict[str, float] = field(default_factory=dict)
+    pictures: tuple[HalvesMean, ...] = ()
 
     @property
     def narrowed(self) -> bool:
@@ -101,8 +103,8 @@ class GaussNewton:
 
     Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
     the expected image equals the reference, for a loss whose derivative is linear in the image. H neglects the curvature of the image,
-    as in Gauss-Newton, and noise may give it negative eigenvalues. For other per-pixel losses, L1 and Huber, ℓ' is damped where noise
-    exceeds the residual (see `PathGradient`, `tolerance`), and the secant ℓ'(r) / r replaces ℓ''.
+    as in Gauss-Newton, and noise may give it negative eigenvalues. For other per-pixel losses, L1 and Huber, the secant w = ℓ'(s) / s
+    replaces ℓ'', and w r replaces ℓ', with s² = r² + κ² σ² of earlier images. So ℓ' is linear in this image, whose noise adds no bias.
 
     Use it for few parameters, such as poses of sensors: each element takes two renders of every view that it changes. It needs no
     derivative of the renderer, so every parameter that can be rendered is supported. A sensor's own parameters only change its own views.
@@ -113,7 +115,7 @@ class GaussNewton:
         shift: target image shift in pixels, > 0. Smaller values are less biased, with more noise at edges.
         width: initial width of the differences, > 0: a fraction of the largest absolute value of a parameter, or in units of the parameter
             if all values are 0.
-        tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
+        tolerance: κ > 0 of the secant, for losses whose derivative is not linear.
         coarse: `shift` at the start, in pixels, >= `shift`; None for `shift` itself. It is halved after each step that is short
             relative to the widths. Images and derivative images are summed over blocks as wide as the shift, so a large shift has
             little noise, and a start several pixels away takes few steps.
@@ -257,6 +259,7 @@ class GaussNewton:
             variances=tuple(system.variances) or state.variances,
             derivatives=tuple(system.derivatives) or state.derivatives,
             residuals=tuple(system.residuals),
+            pictures=tuple(system.pictures),
             hessian=system.products.hessian if system.residuals else None,
             origin=point.theta if system.fresh else state.origin,
             differenced=state.widths if system.derivatives and begins else state.differenced,

@@ -25,7 +25,7 @@ from unrender.estimators.derivative_images import (
     running_mean,
     squared_slope,
 )
-from unrender.estimators.gradient_sum import damping, smoothed_variance
+from unrender.estimators.gradient_sum import smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
 from unrender.statistics.scores import positive_inverse
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 
 _OF_RANGE = 0.125  # largest width relative to the range between a parameter's bounds
+_LEAST_RESIDUAL = 1e-6  # relative residual below which single precision has no sign of it
 _IMAGE = 2  # Stream of a view's key for the image. Lower streams are for the two halves of the derivative images.
 
 
@@ -48,6 +49,7 @@ class System:
         variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.
         residuals: mean derivatives of the loss of each view.
+        pictures: mean image of each view; [] for losses whose derivative is linear.
         fresh: whether there are new derivative images.
     """
 
@@ -60,6 +62,7 @@ class System:
     variances: list[np.ndarray] = field(default_factory=list)
     derivatives: list[HalvesMean] = field(default_factory=list)
     residuals: list[HalvesMean] = field(default_factory=list)
+    pictures: list[HalvesMean] = field(default_factory=list)
 
     def is_finite(self) -> bool:
         """Return whether all sums are finite."""
@@ -112,7 +115,7 @@ class Point:
             if images:
                 total.images[view] = images.mean
                 total.loss += arrays.number(self.problem.loss_value(view, images.mean))
-            weights = self._noise_weighted(view, images, state, total) if images else None
+            weights = self._noise_weighted(view, images, state, total, moved) if images else None
             if not elements.size:
                 continue
             averaged = images is not None and self.options.remember
@@ -154,13 +157,15 @@ class Point:
             total.derivatives.append(mean)
         return mean
 
-    def _noise_weighted(self, view: int, images: HalvedImage, state: GaussNewtonState, total: System) -> LossWeights:
+    def _noise_weighted(
+        self, view: int, images: HalvedImage, state: GaussNewtonState, total: System, moved: float
+    ) -> LossWeights:
         """Return the derivatives of the loss with the weights of the noise, and add the image's variance to `total`.
 
         The weights are of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's
         variance would shift the solution to darker images.
         """
-        weights, limit = self._weights(view, images), self.options.noise_limit
+        weights, limit = self._weights(view, images, state, total, moved), self.options.noise_limit
         if limit is None:
             return weights
         total.variances.append(
@@ -198,20 +203,31 @@ class Point:
         mean, variance = 0.5 * (halves[0] + halves[1]), 0.25 * np.square(halves[0] - halves[1])
         return HalvedImage(array(mean), array(variance), array(halves[0]), array(halves[1]))
 
-    def _weights(self, view: int, images: HalvedImage) -> LossWeights:
-        """Return ℓ' and ℓ'' at the image, and ℓ' at its halves, (H, W, 3) each."""
+    def _weights(
+        self, view: int, images: HalvedImage, state: GaussNewtonState, total: System, moved: float
+    ) -> LossWeights:
+        """Return ℓ' and ℓ'' at the image, and ℓ' at its halves, (H, W, 3) each, and add the image to the mean in `total`."""
         problem, image = self.problem, images.mean
-        derivative = problem.loss_derivative(view, image)
         if problem.loss.linear:
+            derivative = problem.loss_derivative(view, image)
             second = problem.loss_derivative(view, image + 1.0) - derivative
             halves = (problem.loss_derivative(view, half) for half in (images.one, images.other))
             return LossWeights(*map(arrays.numpy, (derivative, second, *halves)))
-        reference, variance = problem.reference(view), smoothed_variance(images.variance)
+        mean, one, other = (arrays.numpy(x) for x in (image, images.one, images.other))
+        new = HalvesMean(one, other)
+        earlier = state.pictures[view] if state.pictures else new
+        total.pictures.append(earlier.and_one(new, moved) if state.pictures else new)
+        secant, reference = self._secant(view, earlier), arrays.numpy(problem.reference(view))
+        return LossWeights(*(secant * x for x in (mean - reference, 1.0, one - reference, other - reference)))
 
-        def damped(of: Array) -> Array:
-            factor = damping(of - reference, variance, self.options.tolerance)
-            return problem.loss_derivative(view, of) * factor
+    def _secant(self, view: int, earlier: HalvesMean) -> np.ndarray:
+        """Return ℓ'(s) / s at s² = r² + κ² σ², (H, W, 3), with the residual r of the mean of earlier images and the variance σ² of one.
 
-        first, residual = damped(image), image - reference
-        secant = first * residual / (residual * residual + 1e-12)
-        return LossWeights(*map(arrays.numpy, (first, secant, damped(images.one), damped(images.other))))
+        The halves' product has no squared noise.
+        """
+        array, reference = self.problem.renderer.array, arrays.numpy(self.problem.reference(view))
+        variance = array(0.25 * earlier.count * np.square(earlier.one - earlier.other))
+        square = np.maximum((earlier.one - reference) * (earlier.other - reference), 0.0)
+        square += self.options.tolerance**2 * arrays.numpy(smoothed_variance(variance))
+        residual = np.sqrt(square + np.square(_LEAST_RESIDUAL * (1.0 + np.abs(reference))))
+        return arrays.numpy(self.problem.loss_derivative(view, array(reference + residual))) / residual
