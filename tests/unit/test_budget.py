@@ -255,6 +255,9 @@ def test_the_end_of_the_steps_leaves_time_for_the_final_pictures(
     run.deadline = time.perf_counter() + seconds
     budget.Budget()._set_last_step(run)
     assert (run.last_step or 0.0) - time.perf_counter() == pytest.approx(left, abs=0.1)
+    run.step, run.clock = 3, 0.15 * left  # 20 steps fill this time, and it advised 10 seconds of 12 on a busy machine
+    run.deadline = time.perf_counter() + seconds - run.clock
+    assert budget._enough(run, 20) == pytest.approx(seconds, rel=0.01)
 
 
 def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from unrender.runs import determination, final_checks, final_images, least_squar
 from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.image_sensitivity import Curvature
 from unrender.runs.metadata import RunAnnotations
+from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.runs.run import Run
@@ -288,6 +289,7 @@ def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) ->
     assert late.without_errors == (
         "fog: no map of standard errors: the end of the run was not tested, or had no time left",
     )
+    assert late.undetermined == (f"whether the pictures show all of fog: {TOO_SHORT}",)
     assert not final_images.render_final_images(made, replace(result, history=[])).without_errors
 
 

@@ -139,7 +139,8 @@ def _enough(run: Run, needed: int) -> float:
     if run.deadline is None or run.seconds is None:
         return steps
     before = max(time.perf_counter() - (run.deadline - run.seconds) - run.clock, 0.0)
-    return (before + steps + _END_SECONDS) / (1.0 - _END_SHARE)
+    busy = min(slowdown(), MOST_SLOWDOWN)
+    return min((before + steps + busy * _END_SECONDS) / (1.0 - busy * _END_SHARE), 2.0 * (before + steps))
 
 
 def few_steps(

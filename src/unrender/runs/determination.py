@@ -165,6 +165,14 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
     return lines
 
 
+def untested_cells(problem: Problem) -> list[str]:
+    """Return a line for all textures, grids and long lists with path gradients: that the run was too short for `undetermined_cells`."""
+    known, shapes = problem.renderer.parameters(), problem.shapes()
+    large = [key for key, shape in shapes.items() if len(shape) >= MAP_AXES or math.prod(shape) > MOST_ELEMENTS]
+    keys = [key for key in large if known[key].differentiable and not known[key].rigid]
+    return [f"whether the pictures show all of {listed(keys)}: {TOO_SHORT}"] if keys else []
+
+
 def common_factor(
     problem: Problem,
     values: Mapping[str, np.ndarray],

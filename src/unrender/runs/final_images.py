@@ -17,6 +17,7 @@ from unrender.runs.determination import (
     common_factor,
     undetermined,
     undetermined_cells,
+    untested_cells,
     untested_factor,
     with_lost,
 )
@@ -158,7 +159,7 @@ def render_final_images(
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             deviations = _without(deviations, late.unchecked)
-            lines = [*untested_factor(problem), *untested_changes(problem), *late.missing()]
+            lines = [*untested_factor(problem), *untested_changes(problem), *untested_cells(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
                 problem, result, sensitivities, left, tests, spent / paths, weights, fits=fits, complete=complete
