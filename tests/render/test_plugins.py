@@ -219,3 +219,33 @@ def test_an_attribute_that_a_shape_lacks_is_named(kind: str) -> None:
     found = [line for line in MitsubaRenderer(lambda: described, 2).notices if "vertex_color" in line]
     expected = "sheet: it has no attribute vertex_color, which a texture of its material reads as 0"
     assert [line.split(";")[0] for line in found] == ([] if kind == "with it" else [expected])
+
+
+@pytest.mark.parametrize(
+    ("name", "x", "told"), [("vertex_color", 1.0, 1), ("vertex_color", 0.0, 0), ("face_color", 1.0, 0)]
+)
+def test_attributes_of_vertices_in_moved_instances_are_told(name: str, x: float, told: int, tmp_path: Path) -> None:
+    """Mitsuba gives 1.2 at (0.2, 0.3) of a triangle whose red is its x coordinate, in an instance moved by 1."""
+    mesh = mi.Mesh("sheet", 3, 1)
+    values = mi.traverse(mesh)
+    values["vertex_positions"], values["faces"] = [0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]
+    values.update()
+    mesh.add_attribute(name, 3, [0, 0, 0, 1, 0, 0, 0, 0, 0] if name.startswith("vertex_") else [0.2, 0, 0])
+    mesh.write_ply(str(tmp_path / "sheet.ply"))
+    material = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": name}}
+    sheet = {"type": "ply", "filename": str(tmp_path / "sheet.ply"), "bsdf": material}
+    copy = {
+        "type": "instance",
+        "to_world": mi.ScalarTransform4f().translate([x, 0, 0]),
+        "group": {"type": "ref", "id": "group"},
+    }
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    parts = {"group": {"type": "shapegroup", "sheet": sheet}, "copy": copy, "sky": {"type": "constant"}}
+    described = {"type": "scene", "camera": camera, **parts}
+    scene = mi.load_dict(described)
+    si = scene.ray_intersect(mi.Ray3f([x + 0.2, 0.3, 1], [0, 0, -1]))
+    assert np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel()[0] == pytest.approx(0.2 + told, abs=1e-4)
+    found = [line for line in MitsubaRenderer(lambda: described, 2).notices if name in line]
+    assert [line.split(",")[0] for line in found] == [
+        "sheet: Mitsuba interpolates vertex_color wrongly in instances with to_world"
+    ] * told

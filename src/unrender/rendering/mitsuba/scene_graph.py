@@ -92,18 +92,26 @@ class ObjectGraph:
         return [shape.id() for shape in shapes]
 
     def missing_attributes(self) -> list[str]:
-        """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""
+        """Return one notice for each attribute that a texture reads from a shape without it, or from vertices in a moved instance.
+
+        Mitsuba reads 0 in place of the first. It interpolates the second at the point in the world between vertices that are not moved.
+        """
         lines = []
+        moved = [str(shape) for shape in self._scene.shapes() if shape.class_name() == "Instance" and _is_moved(shape)]
         for node in self.nodes:
             if not (name := attribute(node)[0]):
                 continue
-            holders = (next((x for x in chain if isinstance(x, mi.Shape)), None) for chain in self.chains(node))
-            missing = {x.id() for x in holders if x is not None and not dr.any(x.has_attribute(name))}
-            lines += [
-                f"{shape}: it has no attribute {name}, which a texture of its material reads as 0; store it in the mesh's PLY file"
-                for shape in sorted(missing)
-            ]
-        return list(dict.fromkeys(lines))
+            for chain in self.chains(node):
+                holder, *above = [x for x in chain if isinstance(x, mi.Shape)] or [None]
+                if holder is not None and not dr.any(holder.has_attribute(name)):
+                    advice = "which a texture of its material reads as 0; store it in the mesh's PLY file"
+                    lines.append(f"{holder.id()}: it has no attribute {name}, {advice}")
+                elif name.startswith("vertex_") and any(f'name = "{x.id()}"' in text for x in above for text in moved):
+                    advice = "so that it may leave its range; use a bitmap, or copies of the mesh"
+                    lines.append(
+                        f"{holder.id()}: Mitsuba interpolates {name} wrongly in instances with to_world, {advice}"
+                    )
+        return sorted(set(lines))
 
     def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
         """Yield every chain of objects from `node` up to the scene. `above` contains the nodes already visited."""
@@ -168,6 +176,11 @@ def all_shapes(scene: Any) -> list[Any]:
     known = {*shapes}
     others = [shape for shape in ObjectGraph(scene).of("shape") if shape not in known]
     return shapes + [shape for shape in others if not shape.class_name().startswith("ShapeGroup")]
+
+
+def _is_moved(instance: Any) -> bool:
+    """Return whether the transform of an instance is not the identity."""
+    return not np.allclose(np.array(mi.traverse(instance)["to_world"].matrix).reshape(4, 4), np.eye(4))
 
 
 def has_instances(scene: Any) -> bool:
