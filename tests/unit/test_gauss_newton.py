@@ -25,6 +25,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
 )
 from unrender.optimizers import AveragedNewton, averaged_newton
+from unrender.optimizers.newton import trust_region_step
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
 from unrender.runs.folder.state import not_finite, pack
@@ -239,6 +240,15 @@ def test_the_first_step_is_newtons_and_long_ones_end_at_the_trust_region() -> No
     steps, _ = optimizer.update(model(HESSIAN, MINIMUM, x, **sigma), optimizer.init({"x": x}), {"x": x})
     assert np.linalg.norm(steps["x"][:2]) == pytest.approx(0.2)  # each of what the Hessian does not connect
     assert abs(steps["x"][2]) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("gradient", [(1.0, 0.0), (1.0, 1e-3), (0.0, 2.0)])
+def test_directions_without_curvature_end_at_the_trust_region(gradient: tuple[float, float]) -> None:
+    """A box that filled the picture had none; NumPy printed that it divides by 0, and the step was not finite."""
+    step = trust_region_step(np.array([10.0, 0.0]), np.array(gradient), 0.5)
+    along = -np.array(gradient) / 10.0 if gradient[1] == 0.0 else step
+    assert step == pytest.approx(along) and step @ gradient < 0.0
+    assert np.linalg.norm(step) == pytest.approx(0.1 if gradient[1] == 0.0 else 0.5)
 
 
 @pytest.mark.parametrize("settled", [None, 1.0])

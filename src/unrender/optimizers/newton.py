@@ -41,14 +41,21 @@ def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: floa
     if radius is None:
         return -gradient / curvatures
     λ = max(0.0, float(np.linalg.norm(gradient)) / radius - float(curvatures.max()))
-    step = -gradient / (curvatures + λ)
+    if not (curvatures + λ).all():
+        λ = max(λ, float((np.abs(gradient) / radius - curvatures).max()))
+    step = _ratio(-gradient, curvatures + λ)
     for _ in range(_SECULAR_ITERATIONS):
         length = float(np.linalg.norm(step))
         if length <= radius * (1 + 1e-10):
             break
-        λ += length**2 / float(np.sum(step * step / (curvatures + λ))) * (length - radius) / radius
-        step = -gradient / (curvatures + λ)
+        λ += length**2 / float(np.sum(_ratio(step * step, curvatures + λ))) * (length - radius) / radius
+        step = _ratio(-gradient, curvatures + λ)
     return trees.clip_norm(step, radius)
+
+
+def _ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return x / y, and 0 where x is 0."""
+    return np.divide(x, y, out=np.zeros_like(x), where=x != 0.0)
 
 
 @register
