@@ -247,7 +247,8 @@ def test_directions_without_curvature_end_at_the_trust_region(gradient: tuple[fl
     """A box that filled the picture had none; NumPy printed that it divides by 0, and the step was not finite."""
     step = trust_region_step(np.array([10.0, 0.0]), np.array(gradient), 0.5)
     along = -np.array(gradient) / 10.0 if gradient[1] == 0.0 else step
-    assert step == pytest.approx(along) and step @ gradient < 0.0
+    assert step == pytest.approx(along)
+    assert step @ gradient < 0.0
     assert np.linalg.norm(step) == pytest.approx(0.1 if gradient[1] == 0.0 else 0.5)
 
 
