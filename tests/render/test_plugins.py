@@ -242,8 +242,8 @@ def test_attributes_of_vertices_in_moved_instances_are_told(name: str, x: float,
     camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
     parts = {"group": {"type": "shapegroup", "sheet": sheet}, "copy": copy, "sky": {"type": "constant"}}
     described = {"type": "scene", "camera": camera, **parts}
-    scene = mi.load_dict(described)
-    si = scene.ray_intersect(mi.Ray3f([x + 0.2, 0.3, 1], [0, 0, -1]))
+    scene: Any = mi.load_dict(described)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x + 0.2, 0.3, 1), mi.Vector3f(0, 0, -1)))
     assert np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel()[0] == pytest.approx(0.2 + told, abs=1e-4)
     found = [line for line in MitsubaRenderer(lambda: described, 2).notices if name in line]
     assert [line.split(",")[0] for line in found] == [

@@ -102,15 +102,14 @@ class ObjectGraph:
             if not (name := attribute(node)[0]):
                 continue
             for chain in self.chains(node):
-                holder, *above = [x for x in chain if isinstance(x, mi.Shape)] or [None]
-                if holder is not None and not dr.any(holder.has_attribute(name)):
+                shapes: list[Any] = [x for x in chain if isinstance(x, mi.Shape)]
+                names = [f'name = "{shape.id()}"' for shape in shapes[1:]]  # of shape groups
+                if shapes and not dr.any(shapes[0].has_attribute(name)):
                     advice = "which a texture of its material reads as 0; store it in the mesh's PLY file"
-                    lines.append(f"{holder.id()}: it has no attribute {name}, {advice}")
-                elif name.startswith("vertex_") and any(f'name = "{x.id()}"' in text for x in above for text in moved):
-                    advice = "so that it may leave its range; use a bitmap, or copies of the mesh"
-                    lines.append(
-                        f"{holder.id()}: Mitsuba interpolates {name} wrongly in instances with to_world, {advice}"
-                    )
+                    lines.append(f"{shapes[0].id()}: it has no attribute {name}, {advice}")
+                elif name.startswith("vertex_") and any(group in text for group in names for text in moved):
+                    what = f"Mitsuba interpolates {name} wrongly in instances with to_world"
+                    lines.append(f"{shapes[0].id()}: {what}, so that it may leave its range; use a bitmap")
         return sorted(set(lines))
 
     def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
@@ -180,7 +179,8 @@ def all_shapes(scene: Any) -> list[Any]:
 
 def _is_moved(instance: Any) -> bool:
     """Return whether the transform of an instance is not the identity."""
-    return not np.allclose(np.array(mi.traverse(instance)["to_world"].matrix).reshape(4, 4), np.eye(4))
+    to_world: Any = mi.traverse(instance)["to_world"]
+    return not np.allclose(np.array(to_world.matrix).reshape(4, 4), np.eye(4))
 
 
 def has_instances(scene: Any) -> bool:
