@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +23,9 @@ from unrender import losses, optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.runs import determination, final_checks, final_images, least_squares
+from unrender.runs import determination, final_checks, final_images, joint_maps, least_squares
 from unrender.runs.callbacks import RUN_PHASES, Callback
-from unrender.runs.image_sensitivity import Curvature
+from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.optimize import optimize
@@ -291,6 +292,20 @@ def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) ->
     )
     assert late.undetermined == (f"whether the pictures show all of fog: {TOO_SHORT}",)
     assert not final_images.render_final_images(made, replace(result, history=[])).without_errors
+
+
+@pytest.mark.parametrize(("width", "words"), [(0.0, ""), (2.0, "a checkerboard of 2 × 2 texels")])
+def test_details_that_pictures_blur_are_told(width: float, words: str, tmp_path: Path) -> None:
+    """A texture of a lamp that only diffuse surfaces reflect fitted the pictures, ended where it began, and had no line."""
+    blurs = np.eye(256).reshape(256, 16, 16)
+    blurs = scipy.ndimage.gaussian_filter(blurs, (0.0, width, width), mode="nearest") if width else blurs
+    truth = {"map": np.random.default_rng(0).uniform(0.3, 0.7, (16, 16, 1))}
+    renderer = AnalyticRenderer(truth, np.repeat(blurs.reshape(256, 256), 3, axis=0), 0.0, 0.1, shape=SHAPE, sensors=1)
+    made = Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], [View(renderer.exact(truth))])
+    result = run(made, run_directory=tmp_path / "run")
+    assert [line for line in result.undetermined if "checkerboard" in line] == [ANY] * bool(words)
+    lines = joint_maps.blurred_cells(made, made.initial_values(), curvature(made), 64, math.inf, None)
+    assert [words in line for line in lines] == [True] * bool(words)
 
 
 def textured(shift: float, noise: float, count: int = 2) -> Problem:

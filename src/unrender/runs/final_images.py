@@ -31,7 +31,7 @@ from unrender.runs.final_checks import (
 )
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
-from unrender.runs.joint_maps import hidden_changes, untested_changes
+from unrender.runs.joint_maps import blurred_cells, hidden_changes, untested_changes
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
@@ -162,7 +162,7 @@ def render_final_images(
             lines = [*untested_factor(problem), *untested_changes(problem), *untested_cells(problem), *late.missing()]
         if everything:
             lines, warnings, deviations, unseen = _undetermined(
-                problem, result, sensitivities, left, tests, spent / paths, weights, fits=fits, complete=complete
+                problem, result, known, left, tests, spent / paths, weights, fits=fits, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
@@ -240,7 +240,7 @@ def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.nda
 def _undetermined(
     problem: Problem,
     result: Result,
-    sensitivities: Mapping[str, np.ndarray],
+    known: Curvature,
     left: Callable[[], float],
     tests: float,
     path_seconds: float,
@@ -258,6 +258,7 @@ def _undetermined(
     """
     if not result.steps:
         return [], (), {}, []
+    sensitivities = known.sensitivity()
     lines = undetermined_cells(sensitivities)
     most = tests if timing.counts() else 0.25 * tests
 
@@ -280,6 +281,8 @@ def _undetermined(
     lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
+    if left() > 0.0:
+        lines += blurred_cells(problem, result.parameters, known, spp, within(seconds), per_pass)
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])

@@ -1,4 +1,4 @@
-"""Detection of textures of one surface whose changes hide one another in the images."""
+"""Detection of changes of textures that the images hide: those of one surface by one another, and details that blur together."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.text import listed
-from unrender.runs.determination import change_of_images, changed
+from unrender.runs.determination import Change, change_of_images, changed
 from unrender.runs.image_sensitivity import (
     ADJOINT,
     MAP_AXES,
+    Curvature,
     adjoint_spp,
     adjoints,
     derivative_session,
@@ -25,7 +26,7 @@ from unrender.runs.image_sensitivity import (
     neighbour_means,
 )
 from unrender.runs.numbers import TOO_SHORT
-from unrender.scene.bounds import off_ends
+from unrender.scene.bounds import off_ends, project
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
 
@@ -38,6 +39,11 @@ _EXPECTED, _NAMED, _LARGE = 0.5, 0.2, 0.1
 change of its values. A smaller change is a small error, even if that of another texture is as large as its range."""
 _STEP, _TURN = 0.2, 0.02
 """Size of the changes relative to those of `changed`, a fiftieth of the range; turn of normals, in units of a normal map."""
+_CHECKER, _OF_CONSTANT = 0.5, 0.1
+"""Size of the checkerboards of `blurred_cells`, relative to the root mean square of the values; most change of the images, relative to that
+of a constant of the same size, that is told."""
+_BLURRED, _SEEN = 4.0, 0.005
+"""Overlap of `Curvature` from which neighbouring texels may not be told apart; least change of the images by the constant."""
 _STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
 """Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
 
@@ -64,6 +70,50 @@ def hidden_changes(
         except InputError:  # the renderer rejects a value
             continue
     return lines
+
+
+def blurred_cells(
+    problem: Problem, values: Mapping[str, np.ndarray], known: Curvature, spp: int, seconds: float, per_pass: int | None
+) -> list[str]:
+    """Return a line for each texture whose differences between neighbouring blocks of cells hardly change the images.
+
+    Each cell may still change them, such as one of a lamp or a sky that only rough surfaces reflect. Checkerboards of blocks are compared
+    with a constant of the same size; the blocks become twice as wide while they hardly show.
+
+    Args:
+        values, spp, per_pass: see `change_of_images`.
+        known: curvature at these values. Textures whose texels hardly overlap in it are not tested.
+        seconds: time after which no block becomes wider.
+    """
+    lines, until, infos = [], timing.now() + seconds, problem.renderer.parameters()
+    for key, square in known.squares.items():
+        overlap = known.overlap.get(key, math.inf)  # infinite if unknown, NaN if noise hides it
+        apart = overlap < _BLURRED or math.isinf(overlap)
+        if apart or infos[key].curved or infos[key].role != "value" or square.ndim != MAP_AXES or not square.any():
+            continue
+        constant, width = _added(problem, values, key, np.ones(1), spp, per_pass), 1
+        y, x, channel = np.indices(shape := np.shape(values[key]))
+        while 2 * width <= min(shape[:2]) and constant.is_above(_SEEN) and (width == 1 or timing.now() < until):
+            signs = np.where((y // width + x // width + channel) % 2, -1.0, 1.0)
+            if not _added(problem, values, key, signs, spp, per_pass).is_below(_OF_CONSTANT, constant.square):
+                break
+            width *= 2
+        if width > 1:
+            lines.append(
+                f"{key}: a checkerboard of {width // 2} × {width // 2} texels changes the pictures by less than a tenth of what a constant "
+                f"does; details of up to {width} texels may be smoothing or noise"
+            )
+    return lines
+
+
+def _added(
+    problem: Problem, values: Mapping[str, np.ndarray], key: str, signs: np.ndarray, spp: int, per_pass: int | None
+) -> Change:
+    """Return the change of the images from values with `signs` times half their root mean square subtracted to those with it added."""
+    own, bounds = np.asarray(values[key], np.float32), problem.unknowns[key].bounds
+    step = (_CHECKER * np.sqrt(np.mean(np.square(own))) * signs).astype(np.float32)
+    first, last = ({**values, key: project(own + of, *bounds)} for of in (-step, step))
+    return change_of_images(problem, first, last, spp, per_pass)
 
 
 def untested_changes(problem: Problem) -> list[str]:
