@@ -572,6 +572,16 @@ def test_a_difference_below_the_noise_of_a_pixel_is_not_compared_with_it() -> No
 SHORT = "has hardly improved since step"
 
 
+@pytest.mark.parametrize(("factor", "told"), [(200.0, True), (1.0, False)])
+def test_pictures_far_off_are_told_after_few_steps_without_a_folder(factor: float, told: bool) -> None:
+    """References from 0 to 255 ended as finished, 99 % of the picture off, without a line: the run had too few paths for larger images."""
+    made = smooth(0.0, 0, known=False)
+    references, start = factor * np.asarray(made.views[0].reference), np.random.default_rng(0).uniform(0.3, 0.9, 9)
+    made = ur.Problem(made.renderer, [ur.Parameter("x", initial=start)], [ur.View(references)])
+    result = ur.optimize(made, ur.PathGradient(spp=4), ur.optimizers.Adam(0.002), steps=10)
+    assert [verification.DIFFERS in line for line in result.warnings].count(True) == told
+
+
 @pytest.mark.parametrize("steps", [40, pytest.param(60, marks=pytest.mark.slow)])
 def test_light_that_no_unknown_explains_is_told_in_short_runs(steps: int) -> None:
     for seed in range(2):

@@ -62,8 +62,9 @@ _LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
 """False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
-_WORTH_A_LINE = 1.25
-"""Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
+_WORTH_A_LINE, _LARGE = 1.25, 0.2
+"""Ratio of the last loss to that of earlier parameters from which a warning says that these are returned; share of the picture from which
+an image of few paths tells."""
 _FIRST_EARLIER, _COST, _OF_TRUTH = 4, 0.014, 8.0
 """First step with an image for short runs, largest share of these in the steps' paths, and time of a check against the truth, in steps."""
 _SMALL, _END, _AGAIN = 1, 2, 3
@@ -150,7 +151,7 @@ class Verify(Callback):
         if result.standard_error and not (differs or places):
             differs = _misfit_of_numbers(problem, pictures, result, first, last)
         if run.folder is None and not (differs or places):
-            differs = self._by_more_paths(run, result, pictures, change, seconds)
+            differs = self._by_more_paths(run, result, pictures, last, change, seconds)
         if differs:
             result = replace(result, standard_error={})
         lines = [differs.line] if differs else []
@@ -226,22 +227,18 @@ class Verify(Callback):
         return others if _is_worse(larger, *others, _LEVEL_AGAIN) else ends
 
     def _by_more_paths(
-        self, run: Run, result: Result, pictures: FreshPictures, change: Mapping[str, Any], seconds: float
+        self, run: Run, result: Result, pictures: FreshPictures, last: Picture, change: dict[str, Any], seconds: float
     ) -> Misfit | None:
-        """Return the difference that final pictures would show, from an image of the end with the paths that are left.
-
-        `change` is the second value of `_residual`; see `_judged` for the others.
-        """
+        """Return the difference that final pictures would show, from an image with the paths that are left, or a large one of `last`.
+        `change` is the second value of `_residual`; see `_judged` for the others."""
         if self._larger is None:
             larger = self._larger_pictures(run, pictures, 1, 0, seconds)
             self._larger = larger and (larger, larger.picture(result.parameters))
-        if self._larger is None:
-            return None
-        larger, end = self._larger
+        larger, end = self._larger or (pictures, last)
         of = larger.differences(end.images), larger.references, larger.weights_of(end.images), larger.sizes
-        return misfit_of_numbers(run.problem, *of) or no_improvement(
-            run.problem, change.get("change", {}), end.loss[0], result.steps, *of
-        )
+        fall = change.get("change", {}), end.loss[0], result.steps
+        differs = misfit_of_numbers(run.problem, *of) or no_improvement(run.problem, *fall, *of)
+        return differs if differs and (self._larger or differs.share > _LARGE) else None
 
     def _larger_pictures(
         self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float, least: int = _LEAST_LARGER
