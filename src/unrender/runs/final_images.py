@@ -72,6 +72,7 @@ _MOST_BYTES, _PICTURES = 1 << 29, 3
 _NOT_TESTED = "the end of the run was not tested, or had no time left"
 """Reason for no standard errors of textures and grids."""
 _SEEDS = {"initial": 1, "result": 2}
+_HALVES = 2 * len(_SEEDS)
 _FEWEST_SAMPLES = 8
 """Fewest samples per pixel of a half with which `unexplained_pixels` judges: of fewer, most pixels miss the rare bright paths."""
 _SECOND_HALF = 1 << 16
@@ -152,7 +153,7 @@ def render_final_images(
         known = curvature(problem, result.parameters, seconds=seconds, noise=noise) if everything else Curvature()
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
         lines, warnings, maps = [], (), _untested(problem, result, _NOT_TESTED)
-        can_check = _cost_of_check(problem) * spent < _PICTURES_SHARE * left()
+        can_check = renderings_of_check(problem) / _HALVES * spent < _PICTURES_SHARE * left()
         differs = _differs(problem, result, chosen, halves_of, samples, can_check)
         still = None if differs else differs_still(problem, result, chosen, ends, samples)
         fits = not differs and (still is None or NOISE in still.causes)
@@ -369,11 +370,6 @@ def _differs(
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
 
 
-def _cost_of_check(problem: Problem) -> float:
-    """Return the time of `unexplained_pixels` relative to that of the pictures, two halves each of the start and of the end."""
-    return renderings_of_check(problem) / (2 * len(_SEEDS))
-
-
 def _first_half(problem: Problem, spp: int, values: Mapping[str, np.ndarray], view: int) -> np.ndarray:
     """Return an image with the random numbers of the first half of a final image of the result."""
     return render(problem, values, view, spp // 2, _SEEDS["result"], per_pass=_per_pass(problem, spp // 2))
@@ -387,7 +383,7 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
         started = timing.now()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = timing.now() - started
-    check = min(_cost_of_check(problem), _MOST_CHECK)
+    check = min(renderings_of_check(problem) / _HALVES, _MOST_CHECK)
     least = _LEAST_SECONDS * min(slowdown(), MOST_SLOWDOWN)
     allowed = min(max(_SHARE * seconds_of_steps(result), least), most_seconds / (1.0 + check))
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
