@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.scene.parameter import Parameter
     from unrender.scene.problem import Problem
+    from unrender.scene.references import View
     from unrender.scene.render import render, render_pair
-    from unrender.scene.view import View
 
 _PACKAGES = (
     *("app", "estimators", "gallery", "images", "io", "losses", "optimizers", "parameterisations", "pixels"),
@@ -70,7 +70,7 @@ _HOMES = {
     "Renderer": "own_loop.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
-    "View": "scene.view",
+    "View": "scene.references",
     "estimate": "runs.optimize",
     "optimize": "runs.optimize",
     "register": "core.registry",

@@ -16,7 +16,7 @@ from unrender.io import images
 from unrender.io import parameter_values as values
 from unrender.losses import L2
 from unrender.rendering.mitsuba.pixel_format import formats
-from unrender.scene.view import View
+from unrender.scene.references import View
 from unrender.scene.view_checks import check_views, read_reference
 
 COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)

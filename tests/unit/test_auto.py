@@ -36,7 +36,7 @@ from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter, ParameterSettings, Unknown
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 SHAPE = (4, 4)
 TRUTH = {"map": np.random.default_rng(0).uniform(0.2, 0.8, (3, 3, 1)), "gain": np.full(1, 200.0)}

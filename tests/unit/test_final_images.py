@@ -35,7 +35,7 @@ from unrender.runs.verification import NOISE, PRIOR, STEPS, STEPS_OF_FEW, Misfit
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 SHAPE = (16, 16)
 

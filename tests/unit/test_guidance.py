@@ -23,7 +23,7 @@ from unrender.runs.watches import remarks
 from unrender.scene.key_hints import instead_of, near_key
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 SHAPE = (4, 4)
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guide"

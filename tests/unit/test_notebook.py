@@ -24,7 +24,7 @@ from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 HOSTILE = '<script>alert("x")</script>'
 

@@ -14,7 +14,7 @@ from unrender.preconditioners import LargeSteps
 from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 HEIGHT, WIDTH = 4, 5
 PIXELS = HEIGHT * WIDTH * 3

@@ -15,7 +15,7 @@ from unrender.runs.image_sensitivity import insensitive, sensitivity
 from unrender.runs.map_uncertainty import uncertainty
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 SHAPE, TEXTURE = (8, 8), (4, 3, 2)
 MATRIX = np.random.default_rng(0).random((8 * 8 * 3, 24)) * np.geomspace(0.001, 3.0, 24)

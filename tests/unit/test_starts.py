@@ -20,7 +20,7 @@ from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 SHAPE, TRUTH = (8, 8), {"place": np.array([2.0, 7.0]), "lamp": np.array([4.0])}
 

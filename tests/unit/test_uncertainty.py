@@ -20,7 +20,7 @@ from unrender.runs.map_uncertainty import of_residuals, pixel_noise, uncertainty
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 from unrender.statistics.debiased import overlap
 
 SIZE, TEXELS = 12, 6

@@ -17,7 +17,7 @@ from unrender.losses import L2, Loss
 from unrender.rendering.renderer import ParameterInfo, Rendering, RenderSession, SampleRequest, Space
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 _MEAN, _FIRST_RATE = 2.0, 1.5
 

@@ -20,7 +20,7 @@ from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 _CENTRES = ((-0.5, 0.35), (0.5, 0.35), (0.0, -0.45))
 _RADIUS, _PANE, _LAMP = 0.36, 1.4, 3.4  # radius of the lenses, and distances of pane and lamp from the screen

@@ -23,7 +23,7 @@ from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0  # radii of the planets and of the two sides of the glass
 _APART = 1.05  # distance of each planet from the centre

@@ -24,7 +24,7 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     ScoreCovariance,
 )
-from unrender.optimizers import rates
+from unrender.optimizers.base import check_rates, rates_of
 from unrender.optimizers.directions import coordinate_scales, sides_of_bounds
 from unrender.optimizers.newton import trust_region_step
 from unrender.optimizers.transforms.base import checked_keys
@@ -139,7 +139,7 @@ class AveragedNewton:
 
     def __post_init__(self):
         object.__setattr__(self, "linear", checked_keys("AveragedNewton: linear", self.linear))
-        rates.check("AveragedNewton", self.learning_rate, None)
+        check_rates("AveragedNewton", self.learning_rate, None)
         checks.fields(self)
 
     @property
@@ -149,7 +149,7 @@ class AveragedNewton:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AveragedNewtonState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter."""
-        own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
+        own = rates_of("AveragedNewton", parameters, self.learning_rate, learning_rates)
         if unknown := next((key for key in self.linear if key not in parameters), None):
             raise InputError(
                 f'AveragedNewton: linear: unknown parameter "{unknown}"{did_you_mean(unknown, parameters)}'

@@ -14,7 +14,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
-from unrender.optimizers import rates
+from unrender.optimizers.base import check_rates, rates_of, schedule_factor
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_transforms
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 from unrender.schedules import Schedule
@@ -70,12 +70,12 @@ class Recipe(ABC):
         return Capabilities(Gradient, *(kind for part in self._composed for kind in part.requires))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
-        own = rates.per_parameter(type(self).__name__, parameters, self.learning_rate, learning_rates)
+        own = rates_of(type(self).__name__, parameters, self.learning_rate, learning_rates)
         return ChainState(0, own, tuple(part.init(parameters, own) for part in self._composed))
 
     def update(self, estimate: Estimate, state: ChainState, parameters: Tree) -> tuple[Tree, ChainState]:
         """Return the steps and the next state. Lazy on Dr.Jit unless a transform waits: evaluate both together."""
-        factor = rates.factor(type(self).__name__, self.schedule, state.step)
+        factor = schedule_factor(type(self).__name__, self.schedule, state.step)
         if not 0 <= state.begun <= state.step:
             raise InputError(f"state of {type(self).__name__}: begun at step {state.begun}, is at step {state.step}")
         made, gradient = state.step - state.begun, estimate.gradient
@@ -116,7 +116,7 @@ class Chain(Recipe):
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("Chain", self.learning_rate, self.schedule)
+        check_rates("Chain", self.learning_rate, self.schedule)
         object.__setattr__(self, "transforms", checked_transforms("Chain: transforms", self.transforms))
 
     def compose(self) -> tuple[StepTransform, ...]:

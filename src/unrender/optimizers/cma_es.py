@@ -18,7 +18,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.optimizers import rates
+from unrender.optimizers.base import check_rates, rates_of
 
 _TOLERANCE = 0.01
 """Distance between parameters and mean, in standard deviations, below which they count as equal."""
@@ -86,7 +86,7 @@ class CMAES:
     learning_rate: float | Mapping[str, float] = 1.0
 
     def __post_init__(self):
-        rates.check("CMAES", self.learning_rate, None)
+        check_rates("CMAES", self.learning_rate, None)
         if self.population is not None:
             checks.integer("CMAES", "population", self.population, at_least=4)
         checks.fields(self)
@@ -97,7 +97,7 @@ class CMAES:
         return Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
-        own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
+        own = rates_of("CMAES", parameters, self.learning_rate, learning_rates)
         start = trees.ravel(parameters) / trees.repeat_per_element(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))
         ranks, held = np.zeros((0, population), np.int32), np.zeros(0, np.int32)

@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import AtBounds, Smoothing
-from unrender.optimizers import rates
+from unrender.optimizers.base import check_rates, rates_of, schedule_factor
 from unrender.optimizers.chain import ChainState
 from unrender.optimizers.recipes import Adam
 from unrender.scene.upsampling import NotCarried, Upsampler
@@ -70,7 +70,7 @@ class DirectionOptions(Protocol):
 
 def check_options(owner: str, options: DirectionOptions) -> None:
     """Raise `InputError` for an option out of range or of the wrong type."""
-    rates.check(owner, options.learning_rate, options.schedule)
+    check_rates(owner, options.learning_rate, options.schedule)
     if checks.number(owner, "step_scale", options.step_scale, above=0.0) > 1.0:
         raise InputError(f"{owner}: step_scale must be at most 1, got {options.step_scale!r}")
     if options.inner_optimizer is not None and not isinstance(options.inner_optimizer, Adam):
@@ -81,7 +81,7 @@ def init_state(
     owner: str, options: DirectionOptions, parameters: Tree, learning_rates: Mapping[str, float] | None
 ) -> NewtonState:
     """Return the state before the first step. Raises `InputError` for an invalid learning rate or an unknown parameter."""
-    own = rates.per_parameter(owner, parameters, options.learning_rate, learning_rates)
+    own = rates_of(owner, parameters, options.learning_rate, learning_rates)
     adam = None
     if options.inner_optimizer is not None:
         adam = options.inner_optimizer.init(_on_host(parameters), learning_rates)
@@ -128,7 +128,7 @@ def apply_direction(
         opposite = trees.unravel(-direction, _on_host(parameters))
         steps, adam = options.inner_optimizer.update(Estimate(0.0, opposite), adam, opposite)
         step = trees.ravel(steps)
-    factor = rates.factor(owner, options.schedule, state.step)
+    factor = schedule_factor(owner, options.schedule, state.step)
     return trees.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)
 
 

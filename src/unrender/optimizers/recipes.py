@@ -11,7 +11,7 @@ from unrender.core.checks import Fraction, NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.optimizers import rates
+from unrender.optimizers.base import check_rates
 from unrender.optimizers.chain import ChainState, Recipe
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.averages import DecayingSum, GradientMean, ScheduleFreeAverage
@@ -50,7 +50,7 @@ class Adam(Recipe):
     uniform: bool = False
 
     def __post_init__(self):
-        rates.check("Adam", self.learning_rate, self.schedule)
+        check_rates("Adam", self.learning_rate, self.schedule)
         checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
@@ -76,7 +76,7 @@ class SGD(Recipe):
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("SGD", self.learning_rate, self.schedule)
+        check_rates("SGD", self.learning_rate, self.schedule)
         checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
@@ -113,7 +113,7 @@ class MetaAdam(Recipe):
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("MetaAdam", self.learning_rate, self.schedule)
+        check_rates("MetaAdam", self.learning_rate, self.schedule)
         checks.fields(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
@@ -187,7 +187,7 @@ class ScheduleFree(Recipe):
 
     def __post_init__(self):
         checks.fields(self)
-        rates.check("ScheduleFree", self.learning_rate, self.schedule)
+        check_rates("ScheduleFree", self.learning_rate, self.schedule)
         keys = checked_keys("ScheduleFree: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
         object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))

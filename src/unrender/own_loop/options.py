@@ -22,8 +22,8 @@ from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Renderer as RendererPort
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
+from unrender.scene.references import View
 from unrender.scene.validation import open_renderer
-from unrender.scene.view import View
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from unrender.core import arrays, memory
 from unrender.core.geometry import weld
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
-from unrender.optimizers import rates
-from unrender.optimizers.base import Optimizer
+from unrender.optimizers.base import Optimizer, rates_of
 from unrender.optimizers.recipes import Adam, MetaAdam
 from unrender.pixels.uniform import Views
 from unrender.runs.callbacks import Callback
@@ -163,9 +162,7 @@ def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
     if not isinstance(optimizer, (Adam, MetaAdam)):
         return []
     lines = []
-    each = rates.per_parameter(
-        type(optimizer).__name__, problem.unknowns, optimizer.learning_rate, problem.learning_rates
-    )
+    each = rates_of(type(optimizer).__name__, problem.unknowns, optimizer.learning_rate, problem.learning_rates)
     for key, unknown in problem.unknowns.items():
         rate, (low, high) = each[key], unknown.bounds
         if unknown.transform is None and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):

@@ -27,7 +27,7 @@ from unrender.scene.coordinates import Coordinates
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.meshes import check_surfaces
 from unrender.scene.parameter import Parameter, ParameterSettings, Unknown, scene_keys, tied, ties_of
-from unrender.scene.references import References, ViewLosses, likelihood_scale
+from unrender.scene.references import References, View, ViewLosses, likelihood_scale
 from unrender.scene.surfaces import Surface
 from unrender.scene.validation import (
     Bounds,
@@ -45,7 +45,6 @@ from unrender.scene.validation import (
     renderer_notices,
     texture_coordinates,
 )
-from unrender.scene.view import View
 from unrender.scene.view_checks import check_views, known_angles
 from unrender.scene.view_worlds import check_determined, is_storable, known_keys, of_views, requested_depth
 

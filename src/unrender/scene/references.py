@@ -1,10 +1,12 @@
-"""References of all views: values and loss weights of their pixels, their noise, and losses of images compared with them."""
+"""Views, and the references of all of them: values and loss weights of their pixels, their noise, and losses of images."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +15,6 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.io.stored_pictures import StoredPicture
-from unrender.scene.view import View
 
 if TYPE_CHECKING:
     from unrender.scene.problem import Problem
@@ -27,6 +28,48 @@ from unrender.rendering.renderer import Renderer
 
 ON_DEVICE = 1 << 29
 """Maximum size in bytes of references that are copied to the device; larger sets stay in host memory."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A reference image of the scene and its sensor.
+
+    Args:
+        reference: file, or array (H, W, 3), in linear RGB. 8- and 16-bit files are converted from sRGB. An array has the film's format:
+            luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Of 8- and 16-bit images with alpha only opaque pixels
+            count, since rendered edges mix an object with what is behind it. Alpha of floating-point images is ignored, because films
+            store premultiplied colours.
+        sensor: index of the scene's sensor.
+        weight: factor of this view's loss, > 0.
+        mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones. Of an image whose alpha varies, its alpha.
+        known: {key: value} of parameters that have this value in this view alone, such as lamps that are off, or the pose of an object on
+            a turntable. Values as for `Parameter.initial`. An unknown among them does not act on this view. None for the problem's scene
+            as it is.
+        scene: Another scene that this view is of, as for `Problem`: an .xml file, a dictionary, a function, or a renderer. Unknowns are
+            those of the problem's scene; the ones that this scene has under the same key act on it. None for the problem's scene.
+        aov: What the reference contains in place of colour, for the first surface that each pixel sees: "depth" (distance), "position",
+            "sh_normal" (shading normal), "albedo" (diffuse reflectance), in world space, or "mask" (1 on surfaces). Background is 0. None
+            for colour.
+    """
+
+    reference: str | Path | np.ndarray | StoredPicture
+    sensor: int = 0
+    weight: float = 1.0
+    mask: str | Path | np.ndarray | StoredPicture | None = None
+    known: Mapping[str, Any] | None = None
+    scene: str | Path | dict[str, Any] | Callable[[], Any] | Any = None
+    aov: str | None = None
+
+    @property
+    def own_world(self) -> bool:
+        """Return whether the view shows other values, another scene or another quantity than the problem's scene."""
+        return self.known is not None or self.scene is not None or self.aov is not None
+
+    def pixel_weights(self, size: int | tuple[int, int] | None = None) -> np.ndarray:
+        """Return the factor of each pixel's loss: the mask (H, W) of a loaded view, or ones of `size`, by default the reference's."""
+        if self.mask is not None:
+            return np.asarray(self.mask)
+        return np.ones(np.asarray(self.reference).shape[:2] if size is None else size)
 
 
 class References:

@@ -45,7 +45,7 @@ from unrender.rendering.picture_format import AOVS
 from unrender.scene import coarse_to_fine
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 
 _Number = StrictFloat | StrictInt
 

@@ -34,9 +34,8 @@ from unrender.losses import Censored, Loss
 from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.bounds import angle_notice
-from unrender.scene.references import ON_DEVICE
+from unrender.scene.references import ON_DEVICE, View
 from unrender.scene.validation import is_number
-from unrender.scene.view import View
 
 _DARKEST = -1e-4  # ratio to the largest value above which negative values count as rounding error
 

@@ -20,7 +20,7 @@ from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.turns import TurnsLights, turns_of, with_scene
 from unrender.rendering.worlds import World, with_worlds, worlds_of
-from unrender.scene.view import View
+from unrender.scene.references import View
 from unrender.scene.view_checks import check_sensor
 
 

@@ -15,7 +15,7 @@ from unrender.rendering.expressions import expression_layer
 from unrender.rendering.photographs import scene_renderer, sensors_with_rows, with_photographs
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem, open_scene
-from unrender.scene.view import View
+from unrender.scene.references import View
 from unrender.scene.view_worlds import requested_depth
 
 _Owner = TypeVar("_Owner", View, Parameter)

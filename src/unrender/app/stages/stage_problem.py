@@ -24,7 +24,7 @@ from unrender.scene.coarse_to_fine import NEVER, CoarseToFine
 from unrender.scene.parameter import Parameter, ties_of
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
+from unrender.scene.references import View
 from unrender.scene.view_worlds import requested_depth
 
 
