@@ -20,6 +20,7 @@ from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.picture_format import AOVS
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.determination import undetermined
+from unrender.runs.verification import misfit, residuals_of_views
 from unrender.scene.fingerprint import fingerprint
 
 pytestmark = pytest.mark.mitsuba
@@ -159,6 +160,17 @@ def test_depths_do_not_hide_changes_of_colour_from_tests() -> None:
     assert not undetermined(made, {key: np.full(3, 12.0, np.float32)}, 16)
 
 
+def test_a_wrong_depth_beside_colours_is_a_difference() -> None:
+    """Depths of 2 for 4 are off by half, right colours by nothing: together by half over the root of 2. It had been a hundredth of that."""
+    views = [ur.View(np.full((SIZE, SIZE, 3), 0.04)), ur.View(np.full((SIZE, SIZE), 4.0), aov="depth")]
+    noise = np.random.default_rng(0).normal(1.0, 1e-3, (2, 8, SIZE, SIZE, 3)).astype(np.float32)
+    images = [list(0.04 * noise[0]), list(2.0 * noise[1])]
+    residuals, references, weights, sizes = residuals_of_views(problem(views, (MOVES,)), [0, 1], images)
+    found = misfit(residuals[0::2], residuals[1::2], references, weights, sizes, 0.05)
+    assert found is not None
+    assert found.error / found.size == pytest.approx(0.5 / np.sqrt(2.0), rel=0.01)
+
+
 @pytest.mark.parametrize("name", ["depth", "mask"])
 def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     made = problem([ur.View(picture(name, x=0.3), aov=name)], ("ball.translation.x",))
@@ -283,6 +295,16 @@ def test_an_unknown_that_no_view_shows_is_refused(key: str, views: list[ur.View]
     with pytest.raises(InputError, match=rf"parameters\[0\].key: no view depends on {key}: {message}"):
         made()
     made(ur.View(np.zeros((SIZE, SIZE, 3)), sensor=len(second)))
+
+
+def test_albedos_that_depend_on_normals_show_them() -> None:
+    """A rough conductor's do; its normals were refused as an unknown."""
+    metal = {"type": "cube", "bsdf": {"type": "roughconductor", "alpha": 0.3}}
+    key, renderer = "ball.vertex_normals", MitsubaRenderer(lambda: scene(ball=metal))
+    normals = np.asarray(renderer.values([key])[key])
+    one, other = (images(renderer.with_aov("albedo"), {key: normals + by}, range(1), 16) for by in (0.0, 0.2))
+    assert np.abs(one - other).max() > 1e-3
+    assert renderer.with_aov("albedo").parameters()[key].shown
 
 
 def test_only_rays_that_hit_a_surface_have_a_vertex() -> None:

@@ -111,15 +111,19 @@ def test_differences_become_sharper_once_steps_are_short() -> None:
     assert shifts == [4.0, 4.0, 2.0, 1.0, 0.5, 0.5]
 
 
-def test_losses_that_are_not_linear_have_a_secant_that_is_damped_by_noise() -> None:
-    """L1 of an image without noise: ℓ' is the sign, ℓ'' is 1 / |r|."""
-    made = problem(ur.losses.L1(), noise=0.0)
+@pytest.mark.parametrize("loss", [ur.losses.L1(), ur.losses.Censored(white=1e-3)], ids=["L1", "Censored"])
+def test_losses_that_are_not_linear_have_a_secant_that_is_damped_by_noise(loss: Any) -> None:
+    """L1 of an image without noise: ℓ' is the sign, ℓ'' is 1 / |r|. Darker images count where the reference is saturated; they had no
+    weight."""
+    made = problem(loss, noise=0.0)
     made.renderer.grain = 0.0  # pyright: ignore[reportAttributeAccessIssue]
     estimate, _ = ur.GaussNewton(2, 2).estimate(made, START, module.GaussNewtonState({"a": 0.1, "b": 0.1}), Key(1))
-    away = MATRIX @ np.concatenate([START[key] - TRUTH[key] for key in START])
-    expected = MATRIX.T @ np.sign(away) / len(MATRIX)
+    away, reference = MATRIX @ np.concatenate([START[key] - TRUTH[key] for key in START]), np.ravel(made.reference(0))
+    counts = (away < 0.0) | (reference < getattr(loss, "white", np.inf))
+    assert ((away < 0.0) & (reference > 1e-3)).any()
+    expected = MATRIX.T @ (np.sign(away) * counts) / len(MATRIX)
     np.testing.assert_allclose(np.concatenate([estimate.gradient[key] for key in START]), expected, rtol=1e-5)
-    weighted = MATRIX.T @ (MATRIX / np.abs(away)[:, None]) / len(MATRIX)
+    weighted = MATRIX.T @ (MATRIX * (counts / np.abs(away))[:, None]) / len(MATRIX)
     np.testing.assert_allclose(estimate.require("test", Hessian).matrix, weighted, rtol=1e-3)
 
 

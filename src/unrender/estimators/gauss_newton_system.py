@@ -223,11 +223,12 @@ class Point:
     def _secant(self, view: int, earlier: HalvesMean) -> np.ndarray:
         """Return ℓ'(s) / s at s² = r² + κ² σ², (H, W, 3), with the residual r of the mean of earlier images and the variance σ² of one.
 
-        The halves' product has no squared noise.
+        The halves' product has no squared noise. s has the sign of r, since losses such as `Censored` are one-sided.
         """
         array, reference = self.problem.renderer.array, arrays.numpy(self.problem.reference(view))
         variance = array(0.25 * earlier.count * np.square(earlier.one - earlier.other))
         square = np.maximum((earlier.one - reference) * (earlier.other - reference), 0.0)
         square += self.options.tolerance**2 * arrays.numpy(smoothed_variance(variance))
-        residual = np.sqrt(square + np.square(_LEAST_RESIDUAL * (1.0 + np.abs(reference))))
+        sign = np.where(earlier.one + earlier.other < 2.0 * reference, np.float32(-1.0), np.float32(1.0))
+        residual = sign * np.sqrt(square + np.square(_LEAST_RESIDUAL * (1.0 + np.abs(reference))))
         return arrays.numpy(self.problem.loss_derivative(view, array(reference + residual))) / residual

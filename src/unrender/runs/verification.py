@@ -38,7 +38,6 @@ relative to the image in this case."""
 _FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.05
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image; that of
 one in few pixels."""
-
 _SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 """Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
@@ -261,16 +260,17 @@ def residuals_of_views(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
     """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views.
 
-    Pixels where an image is not finite have residual and weight 0.
+    Pixels where an image is not finite have residual and weight 0. Views of AOVs beside others are in the unit of colours.
     """
     references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
-    weights = [problem.test_weights(view, of) for view, of in zip(views, images, strict=True)]
+    weights = np.concatenate([problem.test_weights(*of).ravel() for of in zip(views, images, strict=True)])
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
     finite = np.isfinite(residuals.sum(axis=(0, 2)))
-    weights = np.concatenate([np.ravel(x) for x in weights]) * finite
-    return np.where(finite[:, None], residuals, 0.0), pixels, weights, sizes
+    units = np.repeat(np.array([problem.units[view] for view in views], np.float32), [math.prod(of) for of in sizes])
+    residuals = np.where(finite[:, None], residuals * units[:, None], 0.0)
+    return residuals, pixels * units[:, None], weights * finite / units**2, sizes
 
 
 def compares(problem: Problem) -> bool:

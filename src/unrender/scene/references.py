@@ -259,12 +259,11 @@ class ViewLosses:
         return array
 
     @cached_property
-    def _unit_weights(self) -> list[float] | None:
-        """Ratios of the mean square of the first kind of references, colour if there is any, to that of each view's kind; None for one
-        kind."""
+    def units(self) -> list[float]:
+        """Ratio of the root mean square of the first kind of references, colour if there is any, to that of each view's kind."""
         kinds = [format_of(self.renderer, view.sensor).aov for view in self.views]
         if len(set(kinds)) == 1:
-            return None
+            return [1.0] * len(kinds)
         squares = {
             kind: np.mean(
                 [
@@ -276,16 +275,15 @@ class ViewLosses:
             for kind in sorted(set(kinds))
         }
         first = next(iter(squares.values()))
-        return [float(first / squares[kind]) if first > 0 and squares[kind] > 0 else 1.0 for kind in kinds]
+        return [math.sqrt(first / squares[kind]) if first > 0 and squares[kind] > 0 else 1.0 for kind in kinds]
 
     def test_weights(self, view: int, images: Sequence[np.ndarray] = ()) -> np.ndarray:
-        """Return the weight (H, W) of each pixel in tests of pictures: the mask's, and 0 for lower bounds of `Censored`.
+        """Return the weight (H, W) of each pixel's square in tests of pictures: the mask's, and 0 for lower bounds of `Censored`.
 
         Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there. Views of AOVs
-        beside others have weights of their unit, so that their references have the mean square of those of colour.
+        beside others have the mask's times the squares of `units`, so that their references count as those of colour.
         """
-        weights = self.views[view].pixel_weights(self.sizes[view])
-        weights = weights if self._unit_weights is None else weights * self._unit_weights[view]
+        weights = self.views[view].pixel_weights(self.sizes[view]) * self.units[view] ** 2
         if not isinstance(self.loss, Censored):
             return weights
         return weights * determined_pixels(

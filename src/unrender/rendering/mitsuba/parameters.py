@@ -100,8 +100,8 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
 
 def shows(aov: str, parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> bool:
     """Return whether an AOV, one of `AOVS`, can depend on the parameter `key` of a traversed scene."""
-    if (leaf := key.rpartition(".")[2]) in _COMPUTED_OR_FIXED:
-        return aov == ("sh_normal" if leaf == NORMALS else "albedo")
+    if (leaf := key.rpartition(".")[2]) in _COMPUTED_OR_FIXED:  # the albedo of a rough conductor depends on its normals
+        return aov == "albedo" or (aov == "sh_normal" and leaf == NORMALS)
     hidden = (mi.Emitter, mi.Medium) if aov == "albedo" else (mi.Emitter, mi.Medium, mi.BSDF)
     chains = _chains(parameters, key, graph)
     return any(not any(isinstance(node, hidden) for node in chain) for chain in chains)
