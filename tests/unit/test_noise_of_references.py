@@ -44,6 +44,20 @@ def test_a_wrong_picture_whose_neighbours_differ_is_told() -> None:
         assert told(wrong, seed, short=True) is None
 
 
+@pytest.mark.parametrize(("turned", "share", "causes"), [(0, 0.9, 1), (1, 0.9, 1), (0, 0.2, 2), (0, 0.0, 2)])
+def test_a_pattern_is_not_the_noise_of_references(turned: int, share: float, causes: int) -> None:
+    """A refracted checkerboard of 14 % of the picture left a wrong index of refraction its standard error. Some of it beside noise may."""
+    y, x = np.indices((SIDE, SIDE)) // 2
+    pattern = (np.where((y + x) % 2, -1.0, 1.0) if turned else np.where(x % 2, -1.0, 1.0)).reshape(-1, 1)
+    for seed in range(10):
+        noise = np.random.default_rng(100 + seed).standard_t(6, (SIDE * SIDE, 3)) / np.sqrt(1.5)
+        wrong = np.sqrt(share) * pattern + np.sqrt(1.0 - share) * noise
+        difference = told(wrong, seed)
+        assert difference is not None
+        assert len(difference.causes) == causes
+        assert ("pattern" in difference.line) is (causes == 1)
+
+
 def test_a_run_whose_reference_has_another_pattern_is_told(tmp_path: Path) -> None:
     side, generator = 16, np.random.default_rng(6)
     matrix, truth = generator.random((side * side * 3, 4)), np.full(4, 0.5)

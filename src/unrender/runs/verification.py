@@ -217,7 +217,7 @@ def as_few_samples(
     """Return a difference as large as the noise of references with few samples per pixel; None if theirs would have many.
 
     Noise of n samples has 1/n of the variance of one sample, in every pixel. Other differences exceed it most in the half of the pixels
-    with less noise. The noise of a pixel's neighbours orders them, because that is independent of the pixel's own.
+    with less noise. The noise of a pixel's neighbours orders them, because that is independent of the pixel's own. A pattern is no noise.
 
     Args:
         residuals: differences of two independent images from the references, (2, N, 3).
@@ -241,11 +241,11 @@ def as_few_samples(
     large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * size
     if not (large and clear and count < _SAMPLES):
         return None
-    explanation = (
-        f", as the noise of references with {count:.2g} samples per pixel would: if they have several times as many, the run "
-        "needs more steps, or light, depth, alignment or something else that is not among the unknowns is wrong"
-    )
-    return Misfit(error, size, 0.0, True, explanation, (STEPS, NOISE))
+    words = f"as the noise of references with {count:.2g} samples per pixel would: if they have several times as many,"
+    if pattern := paired_losses.has_pattern(one, other, weights, sizes):
+        words = "in a pattern that noise lacks:"
+    words += " the run needs more steps, or light, depth, alignment or something else that is not among the unknowns is wrong"
+    return Misfit(error, size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE))
 
 
 def misfit_of_views(

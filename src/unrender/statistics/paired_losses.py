@@ -21,6 +21,8 @@ rate of its test."""
 _BESIDE, _ALONG, _LEAST_SIDE = 4, 2.0, 12
 """Number of lines of pixels, from the third on, to which a picture's outermost line is compared; score of the products along it from which
 its pixels agree; fewest pixels of a side."""
+_OFFSETS, _PATTERN = ((0, DISTANCE), (DISTANCE, 0), (DISTANCE, DISTANCE), (DISTANCE, -DISTANCE)), 0.25
+"""Rows and columns between the pixels of `has_pattern`, and the smallest correlation that counts."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,28 @@ def concentrated(
     # Two pictures tell the noise of a pixel with one degree of freedom.
     needed = Difference(1.0, 1.0, float(products.sum() ** 2 / np.square(products).sum())).quantile(_LEVEL)
     return SystematicDifference(square, SIGNIFICANT * total / (needed * error) if error > 0 else math.inf)
+
+
+def has_pattern(one: np.ndarray, other: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether the difference that two pictures share correlates at a distance of 2, along an axis or a diagonal.
+
+    The references' noise does not. The score of `nearby` misses a texture that is seen in the wrong place, since its sign alternates.
+
+    Args:
+        one, other: differences of two independent pictures from one reference, (N, C).
+        weights, sizes: see `nearby`.
+    """
+    one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
+    least = _PATTERN * float((one * other).sum())
+    for down, right in _OFFSETS:
+        total = squares = 0.0
+        for part, (height, width) in zip(slices_of_images(sizes), sizes, strict=True):
+            a, b = (of[part].reshape(height, width, -1)[:, :: -1 if right < 0 else 1] for of in (one, other))
+            products = (a[down:, abs(right) :] * b[: height - down, : width - abs(right)]).sum(axis=2)
+            total, squares = total + float(products.sum()), squares + float(np.square(products).sum())
+        if abs(total) > max(least, SIGNIFICANT * _OF_PRODUCTS * math.sqrt(squares)):
+            return True
+    return False
 
 
 def at_border(
