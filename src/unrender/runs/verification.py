@@ -244,7 +244,7 @@ def as_few_samples(
     words = f"as the noise of references with {count:.2g} samples per pixel would: if they have several times as many,"
     if pattern := paired_losses.has_pattern(one, other, weights, sizes):
         words = "in a pattern that noise lacks:"
-    words += " the run needs more steps, or light, depth, alignment or something else that is not among the unknowns is wrong"
+    words += " the run needs more steps or another start, or light, depth, alignment or something that is not among the unknowns is wrong"
     return Misfit(error, size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE))
 
 
