@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,16 +16,13 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.io.stored_pictures import StoredPicture
-
-if TYPE_CHECKING:
-    from unrender.scene.problem import Problem
-
-import warnings
-
 from unrender.losses import Censored, Loss
 from unrender.losses.pixelwise import determined_pixels
 from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Renderer
+
+if TYPE_CHECKING:
+    from unrender.scene.problem import Problem
 
 ON_DEVICE = 1 << 29
 """Maximum size in bytes of references that are copied to the device; larger sets stay in host memory."""
