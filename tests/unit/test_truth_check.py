@@ -129,14 +129,15 @@ def test_few_steps_must_lead_further() -> None:
 
 @pytest.mark.parametrize(("steps", "told"), [(8, False), (64, True)])
 def test_a_run_of_few_steps_with_a_better_picture_is_unfinished(steps: int, told: bool) -> None:
-    """The picture shows x + y / 10 alone, so that y walks away while the picture gets better."""
+    """The picture shows x + y / 10 alone, so that y walks away while the picture gets better. After 64 steps it is still 38 % off: the
+    status says so."""
     matrix = np.tile([[1.0, 0.1]], (SIDE * SIDE * 3, 1))
     renderer = AnalyticRenderer({"x": np.zeros(()), "y": np.zeros(())}, matrix, noise=0.1, shape=(SIDE, SIDE))
     truth = {"x": np.array(3.0), "y": np.array(-0.2)}
     reference = (matrix @ [3.0, -0.2]).reshape(SIDE, SIDE, 3)
     problem = ur.Problem(renderer, [ur.Parameter("x"), ur.Parameter("y")], [ur.View(reference)], truth=truth)
     result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.03), steps=steps)
-    assert result.status == "finished"
+    assert result.status == ("does not fit" if told else "finished")
     assert [line.split()[0] for line in result.warnings if "further" in line] == (["y"] if told else [])
 
 
