@@ -95,7 +95,7 @@ def undetermined(
     known, lines, began = problem.renderer.parameters(), [], timing.now()
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
     until = {True: began + max(seconds, most), False: began + seconds}
-    spp, longest = _affordable(problem, spp, seconds, per_pass or spp, path_seconds) if path_seconds else (spp, 0.0)
+    spp, longest = affordable(problem, spp, seconds, per_pass or spp, path_seconds) if path_seconds else (spp, 0.0)
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
         info, (low, high) = known[key], problem.unknowns[key].bounds
         own, initial = np.asarray(values[key], np.float32), problem.unknowns[key].initial
@@ -126,7 +126,7 @@ def undetermined(
     return lines
 
 
-def _affordable(problem: Problem, spp: int, seconds: float, least: int, path_seconds: float) -> tuple[int, float]:
+def affordable(problem: Problem, spp: int, seconds: float, least: int, path_seconds: float) -> tuple[int, float]:
     """Return the samples per pixel for which there is time, from `least` to `spp`, and the time of a change of the images with these."""
     paths = _RENDERINGS / 2 * sum(math.prod(problem.sizes[view]) for view in selected_views(problem))
     spp = max(min(spp, power_of_two(int(seconds / (path_seconds * paths)))), min(least, spp))

@@ -282,8 +282,8 @@ def _undetermined(
     lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
-    if left() > 0.0:
-        lines += blurred_cells(problem, result.parameters, known, spp, within(seconds), per_pass)
+    limits = within(seconds), per_pass, within(most), path_seconds
+    lines += blurred_cells(problem, result.parameters, known, spp, *limits) if left() > 0.0 else []
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])

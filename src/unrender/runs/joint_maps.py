@@ -14,7 +14,7 @@ from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.text import listed
-from unrender.runs.determination import Change, change_of_images, changed
+from unrender.runs.determination import Change, affordable, change_of_images, changed
 from unrender.runs.image_sensitivity import (
     ADJOINT,
     MAP_AXES,
@@ -73,7 +73,14 @@ def hidden_changes(
 
 
 def blurred_cells(
-    problem: Problem, values: Mapping[str, np.ndarray], known: Curvature, spp: int, seconds: float, per_pass: int | None
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    known: Curvature,
+    spp: int,
+    seconds: float,
+    per_pass: int | None,
+    most: float = math.inf,
+    path_seconds: float = 0.0,
 ) -> list[str]:
     """Return a line for each texture whose differences between neighbouring blocks of cells hardly change the images.
 
@@ -81,19 +88,26 @@ def blurred_cells(
     with a constant of the same size; the blocks become twice as wide while they hardly show.
 
     Args:
-        values, spp, per_pass: see `change_of_images`.
+        values, per_pass: see `change_of_images`.
         known: curvature at these values. Textures whose texels hardly overlap in it are not tested.
-        seconds: time after which no block becomes wider.
+        spp: most samples per pixel of a rendering.
+        seconds: time after which no block becomes wider. All textures share it, at `per_pass` samples or more.
+        most: time after which no further texture is tested.
+        path_seconds: time of a path; 0 if unknown.
     """
-    lines, until, infos = [], timing.now() + seconds, problem.renderer.parameters()
-    for key, square in known.squares.items():
-        overlap = known.overlap.get(key, math.inf)  # infinite if unknown, NaN if noise hides it
-        apart = overlap < _BLURRED or math.isinf(overlap)
-        if apart or infos[key].curved or infos[key].role != "value" or square.ndim != MAP_AXES or not square.any():
-            continue
+    lines, began, infos = [], timing.now(), problem.renderer.parameters()
+    keys = [key for key, square in known.squares.items() if square.ndim == MAP_AXES and square.any()]
+    keys = [key for key in keys if infos[key].role == "value" and not infos[key].curved and _may_blur(known, key)]
+    if path_seconds and keys:
+        spp, _ = affordable(problem, spp, seconds / (2 * len(keys)), per_pass or spp, path_seconds)
+    for key in keys:
+        if timing.now() > began + most:
+            break
         constant, width = _added(problem, values, key, np.ones(1), spp, per_pass), 1
         y, x, channel = np.indices(shape := np.shape(values[key]))
-        while 2 * width <= min(shape[:2]) and constant.is_above(_SEEN) and (width == 1 or timing.now() < until):
+        while (
+            2 * width <= min(shape[:2]) and constant.is_above(_SEEN) and (width == 1 or timing.now() < began + seconds)
+        ):
             signs = np.where((y // width + x // width + channel) % 2, -1.0, 1.0)
             if not _added(problem, values, key, signs, spp, per_pass).is_below(_OF_CONSTANT, constant.square):
                 break
@@ -104,6 +118,12 @@ def blurred_cells(
                 f"does; details of up to {width} texels may be smoothing or noise"
             )
     return lines
+
+
+def _may_blur(known: Curvature, key: str) -> bool:
+    """Return whether the texels of a texture overlap in the pictures, or noise hides it; no if that is unknown."""
+    overlap = known.overlap.get(key, math.inf)  # infinite if unknown, NaN if noise hides it
+    return not (overlap < _BLURRED or math.isinf(overlap))
 
 
 def _added(
