@@ -170,12 +170,16 @@ def test_a_view_may_have_a_scene_and_a_film_of_its_own() -> None:
     """One paint in two rooms, of which one is dark on the right, and has a wider film."""
     other = scene(right=0.0, width=12)
     references = [picture(paint=0.3), picture(paint=0.3, right=0.0, width=12)]
-    made = problem([ur.View(references[0]), ur.View(references[1], scene=other)])
+    views = [ur.View(references[0]), ur.View(references[1], scene=other)]
+    made = problem(views)
     assert made.sizes == [(8, 8), (8, 12)]
     values = {WALL: np.full((PAINT, PAINT, 3), 0.3, np.float32)}
     assert agree(ur.render(made, values, view=1, spp=256), references[1])
     result = ur.optimize(made, "auto", steps=60, progress=False)
     assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
+    texts = {WALL: "0.5 * grey"}  # the other room was refused, since it has no parameter "grey"
+    derived = ur.Problem(scene, [ur.Parameter("grey", initial=0.6)], views, expressions=texts)
+    assert agree(ur.render(derived, view=1, spp=256), references[1])
 
 
 @pytest.mark.slow

@@ -329,7 +329,7 @@ def _opened(
     """Return the renderer of a scene, with unknowns that photographs have, and the views by its sensors. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
     renderer = open_scene(scene, max_depth, parameters, known_keys(views), expressions)
-    members = scene_keys(parameters)
+    members = list(dict.fromkeys([*scene_keys(parameters), *(expressions or ())]))
     renderer, located = of_views(
         renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
     )
