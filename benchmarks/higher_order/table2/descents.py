@@ -166,7 +166,7 @@ def descend(
     """One run of the library's, of so many seconds and `Descent.evaluations` at most, the plan of `auto` not counted in the limit.
 
     Args:
-        search: what finds the first point, which counts as a step.
+        search: finds the first point, which counts as a step. Its samples count in the limit.
     """
     size = size_of(problem)
     track, earlier = Track(problem, seconds, evaluations * size), 0.0
@@ -175,6 +175,7 @@ def descend(
         began = work_time()
         point, earlier = search.best(track.points[0], seed)
         track.clock = work_time() - began
+        track.most -= earlier
         track.add(point, track.clock)
         problem = started_at(problem, point)
     if estimator == "auto":
