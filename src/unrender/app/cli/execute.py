@@ -135,7 +135,7 @@ def _map_line(error: np.ndarray, share: np.ndarray) -> str:
     if not decided.any():
         return "decided by the start, by smoothing or by a prior, not by the references"
     median = formatting.number(float(np.median(error[decided])))
-    return f"{median} (median standard error of the {decided.mean():.0%} that the references decided)"
+    return f"{median} (median standard error where the references decided the values, {decided.mean():.0%} of all)"
 
 
 def verified(result: Result) -> str:
