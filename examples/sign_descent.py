@@ -2,8 +2,7 @@ from dataclasses import dataclass, replace
 
 import unrender as ur
 from unrender.core import arrays
-from unrender.optimizers import rates
-from unrender.optimizers.base import Optimizer
+from unrender.optimizers.base import Optimizer, check_rates, rates_of, schedule_factor
 from unrender.schedules import Schedule
 
 
@@ -35,17 +34,17 @@ class SignDescent(Optimizer):
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("SignDescent", self.learning_rate, self.schedule)
+        check_rates("SignDescent", self.learning_rate, self.schedule)
 
     @property
     def requires(self):
         return frozenset({"gradient"})
 
     def init(self, parameters, learning_rates=None):
-        return SignState(0, rates.per_parameter("SignDescent", parameters, self.learning_rate, learning_rates))
+        return SignState(0, rates_of("SignDescent", parameters, self.learning_rate, learning_rates))
 
     def update(self, estimate, state, parameters):
-        factor = rates.factor("SignDescent", self.schedule, state.step)
+        factor = schedule_factor("SignDescent", self.schedule, state.step)
         steps = {
             key: arrays.sign(g) * arrays.scalar(-state.learning_rates[key] * factor, g)
             for key, g in estimate.gradient.items()
