@@ -32,6 +32,12 @@ _CLEARANCE = 0.01
 _FULL_TURN = 2.0 * math.pi + 1e-4  # largest angle in radians that is plausible, with a margin for rounding
 
 
+def ends_of(bounds: Bounds) -> tuple[float, float]:
+    """Return both bounds as numbers, infinite where there is none."""
+    low, high = bounds
+    return -math.inf if low is None else float(low), math.inf if high is None else float(high)
+
+
 def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
     """Return the bounds of a parameter, and a notice of how they were narrowed; "" if they were not.
 

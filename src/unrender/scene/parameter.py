@@ -20,7 +20,7 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.tied import Tie, with_ties
-from unrender.scene.bounds import open_scale, project, sides_of_bounds
+from unrender.scene.bounds import ends_of, open_scale, project, sides_of_bounds
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.meshes import MeshRegularizer, Remeshing
 from unrender.scene.prior import Prior
@@ -211,9 +211,9 @@ class Unknown:
         factors = np.where(lengths > 0.0, wanted / np.where(lengths > 0.0, lengths, 1.0), 1.0)
         if self.is_direction:
             return factors
-        low, high = self.bounds
+        low, high = ends_of(self.bounds)
         scaled = values * factors
-        left = (scaled < (-np.inf if low is None else low)) | (scaled > (np.inf if high is None else high))
+        left = (scaled < low) | (scaled > high)
         return np.where(left.any(axis=-1, keepdims=True), 1.0, factors)
 
     def project(self, values: Array) -> Array:

@@ -18,6 +18,7 @@ import tomli_w
 from unrender.core import tables
 from unrender.io import files, toml_lines
 from unrender.rendering.expressions import expression_layer
+from unrender.scene.bounds import ends_of
 from unrender.scene.parameter import Unknown
 from unrender.scene.problem import Problem
 from unrender.scene.view_worlds import requested_depth
@@ -82,8 +83,7 @@ def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:
     if parameter.initial is not None:
         table |= store.field("initial", parameter.initial, f"parameter{index}-initial")
     if parameter.bounds is not None:
-        low, high = parameter.bounds
-        table["bounds"] = [-np.inf if low is None else float(low), np.inf if high is None else float(high)]
+        table["bounds"] = list(ends_of(parameter.bounds))
     if parameter.learning_rate is not None:
         table["learning_rate"] = float(parameter.learning_rate)
     if parameter.preconditioner is not None:

@@ -17,6 +17,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations import Bounds
 from unrender.rendering.renderer import ParameterInfo
+from unrender.scene.bounds import ends_of
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.problem import Problem
 from unrender.statistics.debiased import normal_equations
@@ -143,7 +144,7 @@ def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]
     values = problem.renderer.values([key for pair in fixed for key in pair])
     if not all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed):
         return False
-    known = {key: _ends(unknown.bounds) for key, unknown in problem.unknowns.items() if not infos[key].rigid}
+    known = {key: ends_of(unknown.bounds) for key, unknown in problem.unknowns.items() if not infos[key].rigid}
     both = [(known[one + x], known[other + x]) for x in (*counted, *moved[one]) if {one + x, other + x} <= known.keys()]
     return all(max(a[0], b[0]) <= min(a[1], b[1]) for a, b in both)  # bounds with a common value
 
@@ -376,16 +377,12 @@ def _value(problem: Problem, key: str, point: np.ndarray, around: np.ndarray) ->
     return np.asarray(unknown.project(value), np.float32)
 
 
-def _ends(bounds: Bounds) -> tuple[float, float]:
-    return -math.inf if bounds[0] is None else bounds[0], math.inf if bounds[1] is None else bounds[1]
-
-
 def _limits(lights: Sequence[tuple[np.ndarray, Bounds]]) -> Bounds:
     """Return the limits of a common factor of values with bounds; 1 is within them."""
     low, high = _FACTORS
     for values, bounds in lights:
         x = np.ravel(values).astype(np.float64)
-        below, above = _ends(bounds)
+        below, above = ends_of(bounds)
         ends = np.sort([below / x[x != 0.0], above / x[x != 0.0]], axis=0)
         low, high = float(ends[0].max(initial=low)), float(ends[1].min(initial=high))
     return min(low, 1.0), max(high, 1.0)
