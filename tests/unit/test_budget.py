@@ -187,7 +187,7 @@ def test_numbers_have_standard_errors_after_few_steps_whatever_the_size_of_the_p
     asked = ur.Problem(made, [ur.Parameter("gain", initial=0.5)], [ur.View(made.exact(truth))], truth=truth)
     found = ur.optimize(asked, ur.PathGradient(), ur.optimizers.Adam(0.001), 16, run_directory=tmp_path / "run")
     assert not any("too short for this test" in line for line in found.undetermined)
-    assert ends[0] < 1.0
+    assert ends[0] < 1.5
 
 
 @pytest.mark.parametrize("rigid", [False, True])

@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
-from unrender.runs.budget import MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
+from unrender.runs.budget import MOST_SLOWDOWN, cost_of_numbers, seconds_of_steps, slowdown
 from unrender.runs.determination import (
     common_factor,
     undetermined,
@@ -105,7 +105,7 @@ class FinalImages:
 def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True, counted: float = math.inf) -> None:
     """Compile the kernels of `render_final_images` with an image of one pass per view and, if `tested`, one pass of each test.
 
-    `counted` is the time for final pictures and tests if renderings are counted; otherwise infinite.
+    `counted` is the time for the check of few numbers if renderings are counted; otherwise infinite.
     """
     pass_spp, count = _pass_spp(problem), len(problem.views)
     own = count if count < MANY_SENSORS else 1  # more of them share their kernels
@@ -274,7 +274,7 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
     of_numbers = allowed
     if timing.counts():
-        of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_end(result.history[-1]["samples"], result.steps))
+        of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
     numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights)
     deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)

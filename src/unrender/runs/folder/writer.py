@@ -24,7 +24,7 @@ from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
-from unrender.runs.budget import cost_of_end
+from unrender.runs.budget import cost_of_end, cost_of_numbers
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_checks import with_misfit
 from unrender.runs.final_images import at_start, render_final_images, warm_up
@@ -164,7 +164,7 @@ class RunWriter(Callback):
             run.tested = run.seconds is None or run.time_left() > share * run.seconds
             with phases.phase(callbacks.COMPILING):
                 steps = run.steps or 0
-                counted = math.inf if run.seconds else cost_of_end(steps * warm["samples"] / WARM_UP_STEPS, steps)
+                counted = math.inf if run.seconds else cost_of_numbers(steps * warm["samples"] / WARM_UP_STEPS, steps)
                 warm_up(run.problem, run.full(), run.tested, counted)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
