@@ -445,6 +445,26 @@ def test_numbers_have_no_standard_errors_where_a_distortion_of_the_reference_wou
     assert (first in far, first in found.distorted) == (bool(far), False)
 
 
+@pytest.mark.parametrize(
+    ("brightness", "turned", "words"),
+    [(1.0, False, ""), (0.97, False, ""), (0.7, False, "were 0.7 times as bright"), (1.0, True, "do not explain")],
+)
+def test_a_distortion_that_explains_little_of_the_difference_has_no_name(brightness: float, turned: bool, words: str):
+    """A mirrored reference looked blurred, and so did one that was darker by half a stop."""
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    scenery, spot = _scenery(x, y), _seen(0.0, x, y) - _scenery(x, y)
+    renderer = AnalyticRenderer(
+        {"a": np.zeros(1)}, spot.reshape(-1, 1), offset=scenery, noise=0.0, grain=0.2, shape=(SIDE, SIDE)
+    )
+    noise = np.random.default_rng(2).normal(0.0, 0.02, scenery.shape)
+    reference = brightness * (spot + (_scenery(x + y, y - x) if turned else scenery)) + noise
+    made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [ur.View(reference.astype(np.float32))])
+    end = np.linalg.lstsq(spot.reshape(-1, 1), (reference - scenery).ravel(), rcond=None)[0]
+    found = check_numbers(made, {"a": end.astype(np.float32)}, made.initial_values(), FAR).distorted
+    assert words in found
+    assert bool(found) == bool(words)
+
+
 def test_no_time_no_check():
     made = problem(MATRIX)
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.0)

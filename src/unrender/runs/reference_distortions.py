@@ -21,6 +21,8 @@ _EQUAL, _PLATEAU = 1e-3, 16
 _SURE, _OWN, _LEAST_SIDE = 6.0, 0.05, 8
 """Standard errors of an amount from which a distortion is seen; share of its change of the picture that the unknowns must leave; fewest
 pixels of the shorter side of a picture."""
+_MOSTLY, _BRIGHTER = 0.5, 0.15
+"""Share of the squares of a residual from which a distortion that explains them is named; least relative change of brightness."""
 
 
 def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
@@ -53,8 +55,9 @@ def distortion_of_fit(
 ) -> tuple[str, np.ndarray]:
     """Return which reference looks distorted after a least-squares fit, and the change of the solution with it, (K,); "" and 0 for none.
 
-    Each distortion of a view is fitted together with the K directions of the fit. Brightness is left out, since rare bright samples
-    change it. The distorted pictures have other noise than the residuals to which they are fitted.
+    Each distortion of a view is fitted together with the K directions of the fit. One that explains less than half of its view's residual
+    has no name. Small changes of brightness are left out, since rare bright samples cause them. The distorted pictures have other noise
+    than the residuals to which they are fitted.
 
     Args:
         residuals, after: two independent residuals before and after the step of the fit, (2, P, 3), with the roots of the pixels' weights.
@@ -69,7 +72,7 @@ def distortion_of_fit(
         reference, roots = np.asarray(numbers.problem.views[view].reference, np.float64), numbers.roots(view)
         images = (residuals[:, part] / np.where(roots > 0.0, roots, math.inf)).reshape(2, *size, 3) + reference
         halves = [list(distortions(image, reference).items()) for image in images]
-        for (describe, one), (_, other) in list(zip(*halves, strict=True))[1:]:
+        for index, ((describe, one), (_, other)) in enumerate(zip(*halves, strict=True)):
             both = [np.reshape(change, (len(change), -1, 3)) * roots for change in (one, other)]
             own = 0.5 * (both[0] + both[1])
             shared = np.tensordot(slopes[:, part], own, axes=((1, 2), (1, 2)))
@@ -90,6 +93,9 @@ def distortion_of_fit(
                 middle += scores.covariance(score, score)
             errors = np.sqrt(np.maximum(np.diag(np.linalg.solve(matrix, np.linalg.solve(matrix, middle).T)), 0.0))
             explained = float(amounts @ matrix @ amounts)
-            if explained > most and (np.abs(amounts) > _SURE * errors).any():
-                words, moves, most = f"{AS_IF} {view} {describe(amounts)}", gains @ amounts, explained
+            named = explained > _MOSTLY * float((after[0, part] * after[1, part]).sum())
+            allowed = index > 0 or (named and abs(amounts[0]) > _BRIGHTER)
+            if allowed and explained > most and (np.abs(amounts) > _SURE * errors).any():
+                words = f"{AS_IF} {view} {describe(amounts)}" if named else "by what the unknowns do not explain"
+                moves, most = gains @ amounts, explained
     return words, moves
