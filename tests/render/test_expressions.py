@@ -70,6 +70,7 @@ def problem(
         ("-a[1] + [1, 2] + b ** 0.5 * 0", [-1.0, 0.0]),
         ("(a * a) ** 0.25 - b ** 0.75 * 0", [1.0, 2**0.5]),
         ("(a - 1) ** (b / 3) + a ** [2, 0.5] - 2 ** b / 8", [0.0, 2**0.5]),
+        ("(a - 1) ** (b - 3) + 0 ** (b - 3) + 0 ** b", [2.0, 2.0]),
         ("exp(log(a)) + sqrt(b) * 0", [1.0, 2.0]),
         ("max(a, 1.5) + min(b, 2)", [3.5, 4.0]),
         ("mix(a, b, 0.25) + abs(sin(0)) + cos(0) - 1 + tanh(0)", [1.5, 2.25]),
@@ -248,6 +249,12 @@ def test_one_number_fills_no_vertices(name: str) -> None:
         problem([ur.Parameter(paint)], [replace(view, known={key: 1.0})])
     with pytest.raises(ur.InputError, match=f"expression of {key}: all of its .* numbers are 1 at the initial values"):
         problem([ur.Parameter("size", initial=0.5)], [view], expressions={key: "2 * size"})
+    if name == "positions":
+        point = np.tile([1.0, 2.0, 3.0], renderer.parameters()[key].shape[0] // 3)
+        with pytest.raises(ur.InputError, match=f"parameter {key}: initial: all 24 vertices are at one point"):
+            problem([ur.Parameter(key, initial=point)], [view])
+        with pytest.raises(ur.InputError, match=f"expression of {key}: all of its 24 vertices are at one point"):
+            problem([ur.Parameter("size", initial=point)], [view], expressions={key: "2 * size"})
 
 
 @pytest.mark.slow

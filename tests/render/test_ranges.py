@@ -165,6 +165,9 @@ def test_bounds_across_a_singular_value_are_narrowed_and_a_start_at_it_is_refuse
     assert any("bounds narrowed to [1.01, 2]: images are singular at 1" in line for line in given.notices)
     inside = ur.Problem(glass, [ur.Parameter("ball.bsdf.eta", 1.5, bounds=(1.2, 2.0))], [VIEW])
     assert inside.unknowns["ball.bsdf.eta"].bounds == (1.2, 2.0)
+    below = ur.Problem(glass, [ur.Parameter("ball.bsdf.eta", 0.7)], [VIEW])
+    assert any("bounds narrowed to [0.2, 0.99]: images are singular at 1" in line for line in below.notices)
+    assert not inside.notices
     with pytest.raises(ur.InputError, match=r"singular at 1: expected initial values on one side of it, got 1$"):
         ur.Problem(glass, [ur.Parameter("ball.bsdf.eta", 1.0)], [VIEW])
 

@@ -161,6 +161,8 @@ def test_values_are_tied_unless_they_are_encoded_differently(role: Role) -> None
     [
         ([{"keys": [LEFT, "rihgt.bsdf.alpha.value"]}], "did you mean right.bsdf.alpha.value?"),
         ([{"keys": [LEFT, LAMPS[0]]}], "has the shape (3,), left.bsdf.alpha.value (); expected equal shapes"),
+        ([{"keys": ["floor.bsdf.reflectance.value", LAMPS[0]]}], "expected parameters of one kind"),
+        ([{"keys": ["left.translation", "right.rotation"]}], "read their values differently"),
         ([{"keys": [LEFT, RIGHT]}, {"key": RIGHT}], "is an unknown of its own"),
         ([{"key": "a", "keys": [LEFT, RIGHT]}, {"key": "b", "keys": [RIGHT]}], "is tied to a already"),
         ([{"keys": {LEFT: 0.0}}], f"keys: {LEFT}: expected a finite factor other than 0, got 0.0"),

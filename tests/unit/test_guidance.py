@@ -154,9 +154,11 @@ def test_a_transformation_leads_to_the_pose() -> None:
     assert "box.rotation" in near_key("bax.to_world", known)
     numbered = {f"Cube.00{n}.{part}": ParameterInfo((3,), rigid=True) for n in (1, 2) for part in ("rotation", "scale")}
     assert near_key("Cube.002.to_world", numbered).startswith("; a pose is Cube.002.rotation, Cube.002.scale")
-    assert instead_of("lamp.to_world", known).endswith("has no pose")
+    assert instead_of("lamp.to_world", known).endswith("only lights have a pose")
     sky = {"sky.to_world": NAMELESS, "sky.scale": ParameterInfo(())}  # its brightness
-    assert instead_of("sky.to_world", sky).endswith("has no pose")
+    assert instead_of("sky.to_world", sky).endswith("only lights have a pose")
+    foggy = {"cam2.to_world": NAMELESS, "cam2.x_fov": ABLE, "cam.x_fov": ABLE}
+    assert near_key("cam2.translation", foggy) == "; in a scene with participating media only lights have a pose"
     assert instead_of("box.bsdf.reflectance.value", known) == ""
 
 

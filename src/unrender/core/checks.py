@@ -13,6 +13,8 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
+
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, printable
 
@@ -153,3 +155,9 @@ class DropReport:
         if self.count >= max(1, 10 * self._reported):
             self._reported = self.count
             _log.warning("%s; %d of %d so far were dropped", reason, self.count, self.total)
+
+
+def refuse_masked(value: Any, advice: str) -> None:
+    """Raise `InputError` with advice for a NumPy array of which some elements are masked: as an array they are values like others."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+        raise InputError(f"a masked array has values that do not count: {advice}")

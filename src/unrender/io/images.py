@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from unrender.backend import variant
+from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size
@@ -73,6 +74,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         return replace(picture, notice=f"{path.name}: {picture.notice}" if picture.notice else "")
+    checks.refuse_masked(source, "fill it, and give mask = ~numpy.ma.getmaskarray(image)[..., 0] to the view")
     try:
         array = np.asarray(source)
     except (TypeError, ValueError) as error:

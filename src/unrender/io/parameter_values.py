@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import periodic
+from unrender.core import checks, periodic
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, resampling, volumes
 
@@ -89,6 +89,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
             raise InputError(f"{path}: no such file; expected a number, a colour, or a picture or grid file")
         values, notice = _from_file(path, shape, conversion)
         return periodic.repeat(conversion.stored(values), conversion.repeated), notice
+    checks.refuse_masked(initial, "fill it")
     try:
         array = np.asarray(initial)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
@@ -115,6 +116,11 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         return np.array(np.broadcast_to(array.reshape(-1) if colour else array.reshape(()), shape)), ""
     got = f"an array of shape {array.shape}" if array.size != 1 else f"the number {array.item():g}"
     raise InputError(f"expected {_expected(shape, conversion)}, got {got}")
+
+
+def at_one_point(positions: np.ndarray) -> bool:
+    """Return whether the positions (n V,) of several vertices are all equal."""
+    return positions.size > 3 and not np.ptp(positions.reshape(-1, 3), axis=0).any()
 
 
 def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -> tuple[np.ndarray, str]:

@@ -31,9 +31,10 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 
 
 def _power(a: Any, b: Any) -> Any:
-    """Return a ** b. For b up to 1 the derivative by a at 0 is infinite or 1, where Dr.Jit's is 0."""
+    """Return a ** b. Dr.Jit has NaN for 0 ** 0, which is 1, and 0 for the derivative by a at 0 where b is at most 1: infinity or 1."""
     if isinstance(b, float) and not 0.0 < b < 1.0:
         return a**b
+    a = a if isinstance(a, float) and a != 0.0 else dr.select((a == 0.0) & (b == 0.0), 1.0, a)
     root, line = (a == 0.0) & (b > 0.0) & (b < 1.0), (a == 0.0) & (b == 1.0)
     return dr.select(root, dr.sqrt(dr.select(root, a, 1.0)), dr.select(line, a, a**b))
 

@@ -16,7 +16,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.text import did_you_mean, listed
 from unrender.core.trees import Tree
-from unrender.io import bounded_files
+from unrender.io import bounded_files, parameter_values
 from unrender.rendering.expression_texts import Function, parse
 from unrender.rendering.renderer import (
     Derivatives,
@@ -167,6 +167,8 @@ class ExpressionRenderer(RendererWrapper):
             raise KeyedError(one.key, "it is not finite at the initial values")
         if value.size > 1 and not info.conversion.takes_number and not np.ptp(value):
             raise KeyedError(one.key, f"all of its {value.size} numbers are {value.flat[0]:g} at the initial values")
+        if info.welded and parameter_values.at_one_point(value):
+            raise KeyedError(one.key, f"all of its {value.size // 3} vertices are at one point at the initial values")
         if not arrays.all_within(value, info.lowest, info.highest):
             limits = " and ".join(checks.limits(info.lowest, info.highest))
             raise KeyedError(

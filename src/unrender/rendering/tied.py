@@ -71,7 +71,8 @@ class Tie:
                     self.key, f"{member} has the shape {info.shape}, {first} {infos[0].shape}; expected equal shapes"
                 )
             encodings = {one.role if one.role in _ENCODED else "value" for one in (info, infos[0])}
-            if info.conversion != infos[0].conversion or len(encodings) > 1:
+            meanings = {meaning for one in infos if (meaning := _meaning(one))}
+            if info.conversion != infos[0].conversion or len(encodings) > 1 or len(meanings) > 1:
                 raise KeyedError(
                     self.key, f"{member} and {first} read their values differently; expected parameters of one kind"
                 )
@@ -108,6 +109,13 @@ class Tie:
                 self.key, f"with these factors no range of values is within the ranges of {' and '.join(self.factors)}"
             )
         return (float(low) if np.isfinite(low) else None), (float(high) if np.isfinite(high) else None)
+
+
+def _meaning(info: ParameterInfo) -> str:
+    """Return the quantity of a parameter; "" for one that may share its values with others, as a weight may with a colour."""
+    if info.rigid or info.nonlinear:
+        return "angle" if info.angle else "pose" if info.rigid else "form"
+    return info.brightness or ("medium" if info.scattering == "medium" else "")
 
 
 def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:

@@ -63,8 +63,9 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
             f"images are singular at {singular:g}: expected initial values on one side of it, got {_span(start)}"
         )
     gap = min(_CLEARANCE * abs(singular), float(np.min(np.abs(start - singular), initial=np.inf)) / 2)
-    side = (singular + gap, high) if start.flat[0] > singular else (low, singular - gap)
-    if bounds is None:
+    above = start.flat[0] > singular
+    side = (singular + gap, high) if above else (low, singular - gap)
+    if bounds is None and above:  # as nearly all materials are
         return side, ""
     return side, f"bounds narrowed to {_interval(side)}: images are singular at {singular:g}"
 

@@ -28,6 +28,7 @@ _PLACES = (
 )
 """Names that users may try for the parameters of a pose."""
 _POSE = ("translation", "rotation", "scale")
+_ONLY_LIGHTS = "in a scene with participating media only lights have a pose"
 _SLOTS = frozenset({"bsdf", "data", "value", ""})  # parts of keys that do not name a quantity
 _EQUIVALENTS = (
     {"alpha", "roughness"},
@@ -58,6 +59,8 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
         for near in (owner, *difflib.get_close_matches(owner, owners, n=1)):
             if poses := _poses(near, known):
                 return f"; a pose is {poses}"
+        if f"{owner}.{_TRANSFORM}" in known:
+            return f"; {_ONLY_LIGHTS}"
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
     similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
@@ -104,7 +107,7 @@ def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
         return ""
     if poses := _poses(owner, known):
         return f"; its pose can be: {poses}"
-    return "" if _no_pose(owner, known) else "; a shape in a scene with participating media has no pose"
+    return "" if _no_pose(owner, known) else f"; {_ONLY_LIGHTS}"
 
 
 def _no_pose(owner: str, known: Mapping[str, ParameterInfo]) -> str:

@@ -90,7 +90,7 @@ def check_parameter(
 
     with checking("initial"):
         start, notice = _initial(parameter, info, renderer)
-        _check_normals(start, info)
+        _check_vectors(start, info)
     with checking("bounds"):
         bounds, narrowed = check_bounds(parameter.bounds, info, start)
     with checking("learning_rate"):
@@ -282,9 +282,11 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
     return start, ""
 
 
-def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
-    """Raise `InputError` for a direction of length 0, or a normal map with very short vectors: derivatives grow with the inverse of their
-    length."""
+def _check_vectors(start: np.ndarray, info: ParameterInfo) -> None:
+    """Raise `InputError` for vertices at one point, a direction of length 0, or a normal map with very short vectors: derivatives grow with
+    the inverse of their length."""
+    if info.welded and parameter_values.at_one_point(start):
+        raise InputError(f"all {start.size // 3} vertices are at one point, {start[:3]}; expected a mesh")
     if info.role == "direction" and start.shape == (3,) and not start.any():
         raise InputError("expected a vector of any length above 0, got three zeros")
     if info.role != "normal":
