@@ -128,6 +128,7 @@ def test_processes_that_fill_one_cache_together(tmp_path: Path) -> None:
     assert losses(tmp_path / "one") == losses(tmp_path / "two") == losses(tmp_path / "three")
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps(unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str) -> None:
     """By decades, in both directions, while a run goes on: it is timed by another clock."""
     real, calls = time.time, []

@@ -72,6 +72,7 @@ def matrices(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Non
 # ---------------------------------------------------------------------- a problem that runs
 
 
+@pytest.mark.slow
 def test_masks_alone_become_a_problem_that_runs(unrender: Unrender, capture: Path) -> None:
     answer = unrender("import", capture, "--out", "asset", *SMALL)
     assert answer.status == 0, answer.error
@@ -91,6 +92,7 @@ def test_masks_alone_become_a_problem_that_runs(unrender: Unrender, capture: Pat
     assert [set(stage.unknowns) for stage in stages[2:]] == 2 * [set(_keys(folder))]
 
 
+@pytest.mark.slow
 def test_normals_of_a_mesh_that_is_given_are_taken_as_they_are(unrender: Unrender, capture: Path, mesh: Path) -> None:
     answer = unrender("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4)
     assert answer.status == 0, answer.error
@@ -205,6 +207,7 @@ def test_an_earlier_import_is_replaced_only_when_asked(unrender: Unrender, captu
     assert not Path("asset/held-out.toml").exists()
 
 
+@pytest.mark.slow
 def test_nothing_but_an_earlier_import_is_removed(unrender: Unrender, capture: Path, mesh: Path) -> None:
     given = ("import", capture, "--mesh", mesh, "--resolution", 20, "--texture", 4, "--overwrite", "--out")
     assert unrender(*given, "asset").status == 0
@@ -233,6 +236,7 @@ def test_check_refuses_what_it_would_ignore(option: str, value: object, unrender
     assert not Path("look").exists()
 
 
+@pytest.mark.slow
 def test_check_draws_every_photograph(unrender: Unrender, capture: Path) -> None:
     answer = unrender("import", capture, "--check", "--out", "look", *SMALL[:4])
     assert answer.status == 0, answer.error
@@ -480,7 +484,7 @@ UNUSUAL: dict[str, tuple[Callable[[Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", quick(UNUSUAL, "EXIF rotation", "16 bits", "CMYK"))
+@pytest.mark.parametrize("name", quick(UNUSUAL, "EXIF rotation"))
 def test_an_unusual_capture_is_read_right(
     name: str, unrender: Unrender, capture: Path, made_folder: Path, mesh: Path
 ) -> None:

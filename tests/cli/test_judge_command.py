@@ -157,6 +157,7 @@ def test_formats_stand_beside_one_another(unrender, run: Path, mitsuba_variant: 
     assert unrender("export", "problem.toml", "--out", "begin", "--format", "obj", "--overwrite", *variant).status == 0
 
 
+@pytest.mark.slow
 def test_lights_that_turn_with_the_object_are_told(unrender, problem: Path, mitsuba_variant: str) -> None:
     scene, variant = problem.with_name("wall.xml"), ["--variant", mitsuba_variant]
     lamp = '<emitter type="point"><point name="position" x="0" y="0" z="3"/></emitter>'

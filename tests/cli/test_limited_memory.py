@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tiers import quick
+from tiers import quick, slow
 from unrender.app.cli import memory, signals
 from unrender.backend import limits
 from unrender.core.errors import InputError
@@ -87,9 +87,9 @@ def ended(process: subprocess.Popen[str], seconds: float = 120) -> tuple[int, st
     ("limit", "words"),
     [
         (60_000, ["doctor"]),
-        (300_000, ["methods", "rcv"]),
+        slow(300_000, ["methods", "rcv"]),
         (500_000, TOY),
-        (600_000, ["compare", "exponential"]),
+        slow(600_000, ["compare", "exponential"]),
         (800_000, ["import", "photos"]),
     ],
 )
@@ -106,6 +106,7 @@ def test_the_version_needs_little(tmp_path: Path) -> None:
     assert ended(start(tmp_path, ["--version"], 60_000)) == (0, "")
 
 
+@pytest.mark.slow
 def test_enough_addresses(tmp_path: Path) -> None:
     needed = (memory._BASE + memory._PER_CORE * limits.cores()) >> 10
     assert ended(start(tmp_path, [*TOY, "--steps", "2"], needed)) == (0, "")
@@ -122,7 +123,7 @@ def test_the_libraries_run_out_of_memory(tmp_path: Path, limit: int) -> None:
     assert status == 0 or "out of memory" in said
 
 
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGABRT", "SIGSEGV"])
+@pytest.mark.parametrize("name", ["SIGKILL", slow("SIGABRT"), slow("SIGSEGV")])
 def test_a_container_ends_the_process(tmp_path: Path, name: str) -> None:
     """The kernel kills what takes too much; allocators abort."""
     number = int(signal.Signals[name])
@@ -133,7 +134,7 @@ def test_a_container_ends_the_process(tmp_path: Path, name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("words", [["run", "nowhere.toml"], ["run", "--help"]])
+@pytest.mark.parametrize("words", [["run", "nowhere.toml"], slow(["run", "--help"])])
 def test_in_a_container_all_is_as_elsewhere(tmp_path: Path, words: list[str]) -> None:
     inside, outside = (start(tmp_path, words, None, before) for before in (CONTAINER, ""))
     assert [*inside.communicate(timeout=60), inside.returncode] == [
@@ -160,6 +161,7 @@ def test_a_signal_between_the_processes_is_one_line(tmp_path: Path) -> None:
     assert ended(process) == (130, "unrender: interrupted\n")
 
 
+@pytest.mark.slow
 def test_a_killed_parent_takes_the_command_along(tmp_path: Path) -> None:
     process = start(tmp_path, [*TOY, "--steps", "1000000"], None, CONTAINER)
     lists = Path(f"/proc/{process.pid}/task/{process.pid}/children")

@@ -58,6 +58,7 @@ def test_gallery_tells_the_options_of_one(unrender):
     assert all(option.name in answer.out for option in gallery.options(name))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_a_plan_is_printed_and_its_file_makes_the_same_run(unrender, tmp_path):
     tiny = ("-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8")

@@ -95,6 +95,7 @@ def test_a_sensor_under_a_shared_path_names_the_methods(problem: Path, mitsuba_v
         ur.optimize(ur.Problem.from_file(made), "rcv", steps=1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_references_are_rendered_anew_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str

@@ -52,6 +52,7 @@ def test_no_home_and_no_name(tmp_path: Path) -> None:
     assert (done.returncode, told) == (0, [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("home", quick(["missing", "file"], "missing"))
 def test_a_home_that_cannot_be_written(tmp_path: Path, home: str) -> None:
     (tmp_path / "file").touch()

@@ -30,6 +30,7 @@ def stopped(run_once, mitsuba_variant: str) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_resume_goes_on_and_says_so(unrender, stopped: Path):
     answer = unrender("resume", "result")
     assert answer.status == 0, answer.error
@@ -56,6 +57,7 @@ def test_resume_goes_on_and_says_so(unrender, stopped: Path):
     assert len((stopped / "history.jsonl").read_text().splitlines()) == 12
 
 
+@pytest.mark.slow
 def test_resume_shows_what_changed(unrender, stopped: Path):
     scene = stopped.parent / "wall.xml"
     scene.write_text(scene.read_text().replace("0.2", "0.25"))
@@ -87,6 +89,7 @@ def test_resume_refuses_in_one_line(unrender, stopped: Path, words: list[str], m
     assert answer.refuses(message)
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_second_run_in_the_folder_is_refused(unrender, stopped: Path, mitsuba_variant: str):
     """By another process, which holds it."""
     code = "import sys; from pathlib import Path; from unrender.runs.folder.lock import Lock\n"

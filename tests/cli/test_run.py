@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import unrender as package
-from tiers import quick
+from tiers import quick, slow
 from unrender.app.cli.signals import WAITING
 from unrender.runs.final_images import render_final_images
 
@@ -54,6 +54,7 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     assert f"{KEY} error 0.3109 before, 0.0" in " ".join(answer.out.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", quick(["meta", "coupled"], "coupled"))
 @pytest.mark.usefixtures("short_ends")
 def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsuba_variant: str, method: str):
@@ -145,6 +146,7 @@ def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_va
     assert not (problem.parent / "result").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_run_says_what_was_done_to_the_input_and_warns_of_a_parameter_without_influence(
     unrender, problem: Path, mitsuba_variant: str
@@ -198,6 +200,7 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     assert unrender(*words).error.startswith("unrender: --out both: contains earlier results")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_compare_takes_equal_steps(unrender, problem: Path, mitsuba_variant: str):
     words = [
@@ -261,6 +264,7 @@ def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
     assert record["steps"] == len((folder / "history.jsonl").read_text().splitlines()) >= 1
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_gets_no_traceback():
     source = Path(package.__file__).parents[1]
     process = subprocess.Popen(
@@ -277,7 +281,7 @@ def test_a_reader_that_leaves_gets_no_traceback():
     assert process.wait(timeout=60) == 1
 
 
-@pytest.mark.parametrize("spp", [None, 4])
+@pytest.mark.parametrize("spp", [None, slow(4)])
 def test_final_pictures_are_of_the_result(problem: Path, spp):
     made = package.Problem.from_file(problem)
     result = package.optimize(made, package.PathGradient(spp=2), package.optimizers.Adam(0.3), steps=1)

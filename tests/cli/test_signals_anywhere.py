@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tiers import slow
 from unrender.app.cli import signals as handled
 from unrender.core.errors import InputError
 from unrender.runs.folder import reader
@@ -71,7 +72,7 @@ def await_package(process: subprocess.Popen[str]) -> None:
     assert process.stderr.readline() == "loading\n"
 
 
-@pytest.mark.parametrize(("number", "moments"), [(signal.SIGINT, (0.0, 0.25)), (signal.SIGTERM, (0.1, 0.4))])
+@pytest.mark.parametrize(("number", "moments"), [(signal.SIGINT, (0.0, 0.25)), slow(signal.SIGTERM, (0.1, 0.4))])
 def test_while_the_command_is_loaded(tmp_path: Path, number: signal.Signals, moments: tuple[float, ...]) -> None:
     for n, moment in enumerate(moments):
         process = start(tmp_path / str(n), "methods", "rcv")
@@ -80,6 +81,7 @@ def test_while_the_command_is_loaded(tmp_path: Path, number: signal.Signals, mom
         ended(process, number)
 
 
+@pytest.mark.slow
 def test_an_import_that_never_ends_is_interrupted_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "endless_module.py").write_text("import time\nwhile True: time.sleep(0.02)\n")
     code = textwrap.dedent("""
@@ -94,7 +96,7 @@ def test_an_import_that_never_ends_is_interrupted_all_the_same(tmp_path: Path) -
     assert (done.returncode, done.stderr) == (143, "unrender: terminated\n")
 
 
-@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("again", [slow(False), True])
 def test_compiled_code_that_goes_on_says_why_nothing_happens(tmp_path: Path, again: bool) -> None:
     """The first signal is acknowledged though no handler can run, and the second ends the process."""
     code = textwrap.dedent("""

@@ -12,6 +12,7 @@ import pytest
 import unrender as ur
 from tests.contract import analytic
 from tests.local_hosts import LocalHosts
+from tiers import quick
 from unrender.app.distributed.assignment import assign
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.share import ViewShare
@@ -56,7 +57,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> ur.Result:
     return run(analytic.problem(views=VIEWS), tmp_path_factory.mktemp("alone"), STEPS)
 
 
-@pytest.mark.parametrize("name", EXECUTORS)
+@pytest.mark.parametrize("name", quick(EXECUTORS, "local", "distributed"))
 def test_runs_are_alike_and_change_executors_on_the_way(name: str, alone: ur.Result, tmp_path: Path) -> None:
     problem = analytic.problem(views=VIEWS)
     executor = EXECUTORS[name](problem)

@@ -128,7 +128,7 @@ def test_a_scene_of_another_variant_is_refused(monkeypatch: pytest.MonkeyPatch) 
         ur.Renderer(Foreign(), KEYS)
 
 
-@pytest.mark.parametrize("by_call", [False, True], ids=["explicit", "differentiable"])
+@pytest.mark.parametrize("by_call", [slow(False), True], ids=["explicit", "differentiable"])
 def test_two_threads_draw_what_each_draws_alone(by_call: bool) -> None:
     """Renderers of two threads take turns: neither raises, and no random sequence depends on the other.
 

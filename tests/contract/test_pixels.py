@@ -468,6 +468,7 @@ def test_a_parameter_of_few_elements_counts_as_much_as_one_of_many() -> None:
     assert shares["colour"] == pytest.approx(shares["texture"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_maps_are_means_over_refreshes() -> None:
     """At a standstill four of them have a quarter of the variance of one."""
     asked = problem(noise=0.9)

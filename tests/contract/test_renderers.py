@@ -138,7 +138,7 @@ def test_shapes_are_those_that_the_renderer_tells(name: str) -> None:
     assert arrays.shape(session.tangent_moment(values, alone.paths, values)) == (height, width, 3)
 
 
-@pytest.mark.parametrize("name", without_media(BACKENDS))
+@pytest.mark.parametrize("name", quick(BACKENDS, *(name for name in BACKENDS if name not in ("medium", "poses"))))
 def test_images_of_few_samples_have_the_mean_of_those_of_many(name: str) -> None:
     backend = BACKENDS[name]
     session, state = session_of(backend, backend.renderer()), changed(backend, backend.renderer())[1]

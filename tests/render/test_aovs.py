@@ -140,6 +140,7 @@ def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRend
     assert not agree(None)  # the planted fault: silhouettes that stand still
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", quick(["auto", "plain", "rcv", "coupled", "adaptive"], "auto"))
 def test_albedo_and_depth_share_one_descent(method: str) -> None:
     views = [ur.View(picture("albedo"), aov="albedo", weight=2.0), ur.View(picture("depth"), aov="depth")]
@@ -178,6 +179,7 @@ def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_mesh_may_move_beside_opacity_masks_where_no_view_has_colour() -> None:
     """It was refused: the renderer of colour, which no view uses, has no such derivative."""
     depth = ur.View(np.ones((SIZE, SIZE)), aov="depth")

@@ -83,6 +83,7 @@ def test_few_frames_lead_from_the_command_to_a_bounce(
     assert not recorder.faults()
 
 
+@pytest.mark.slow
 def test_few_frames_lead_to_a_bounce_that_is_traced_at_each_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -278,6 +278,7 @@ class Unweighted:
         return state
 
 
+@pytest.mark.slow
 def test_mini_batches_are_unbiased_after_a_change_whose_probabilities_were_carried() -> None:
     _, _, run, memory = at_the_change("adaptive", "carry")
     state = memory.estimator
@@ -772,6 +773,7 @@ def test_a_parameterised_run_comes_to_its_resolution_and_repeats_when_resumed(
     np.testing.assert_array_equal(ur.resume(tmp_path, fresh(), steps=12).parameters[KEY], whole.parameters[KEY])
 
 
+@pytest.mark.slow
 def test_compiling_at_a_new_resolution_counts_as_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(run: Any) -> Any:
         time.sleep(0.3)

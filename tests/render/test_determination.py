@@ -11,6 +11,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import slow
 from unrender.app import report
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ReplacedMesh
@@ -154,6 +155,7 @@ def test_a_run_tells_in_its_folder(tmp_path: Any):
     assert "wall.bsdf.sheen_tint.value: over its entire range" in page
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_early_is_warned_in_its_folder(tmp_path: Any):
     seen = ur.render(problem(scene(DIFFUSE), COLOUR), spp=64, seed=5)
     made = ur.Problem(scene(DIFFUSE), [ur.Parameter(COLOUR, initial=0.1)], [ur.View(seen)], max_depth=2)
@@ -227,7 +229,7 @@ def test_values_that_start_beside_the_solution_are_determined(bounds: tuple[floa
 
 
 @pytest.mark.parametrize(
-    ("end", "is_lost"), [([40.0, 0.0, 0.0], True), ([0.0, 0.0, 0.3], False), ([0.0, 0.0, 0.0], False)]
+    ("end", "is_lost"), [([40.0, 0.0, 0.0], True), ([0.0, 0.0, 0.3], False), slow([0.0, 0.0, 0.0], False)]
 )
 def test_a_ball_that_ends_outside_of_the_picture_does_not_fit(end: list[float], is_lost: bool):
     """It may cover so few pixels that the pictures hardly differ."""

@@ -296,6 +296,7 @@ def test_a_second_thread_is_refused_while_a_run_goes_on(tmp_path: Path, whole: u
 # ---------------------------------------------------------------------- histories without end
 
 
+@pytest.mark.slow
 def test_a_long_history_is_thinned_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("unrender.runs.folder.writer.THINNED_FROM", 1 << 14)
     folder, steps = tmp_path / "run", 500

@@ -35,6 +35,7 @@ def test_auto_finds_the_right_values(name: str) -> None:
         assert np.linalg.norm(error) < 0.05
 
 
+@pytest.mark.slow
 def test_derivative_images_of_wide_differences_do_not_hold_a_pose() -> None:
     """The first differences move the block by pixels. Means that kept them left its rotation at 0.10 of 0.5 rad, four of twelve seeds."""
     made = few_numbers.problem("pose", 16)
@@ -70,6 +71,7 @@ LIGHTS = {
 BRIGHTNESSES = {"ball.emitter.radiance.value": 25.0, "point.intensity.value": 5.0, "sky.radiance.value": 0.3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "factors", [slow((0.1, 0.1, 0.1)), slow((10.0, 10.0, 10.0)), (10.0, 0.1, 10.0)], ids=["low", "high", "mixed"]
 )
@@ -172,6 +174,7 @@ def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() ->
     np.testing.assert_allclose(result.parameters["cam.aperture_radius"], 0.3, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_environment_maps_alone_are_pulled_to_their_start(tmp_path: Path) -> None:
     """They have texels that pictures hardly show. The state of the pull is part of a checkpoint."""

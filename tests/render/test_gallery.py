@@ -202,6 +202,7 @@ def test_options_act():
     assert (plain.loss, other.loss) == (ur.losses.L1(), ur.losses.Huber())
 
 
+@pytest.mark.slow
 def test_reference_spp_lowers_the_noise_and_equal_calls_give_equal_references():
     coarse, again, fine, finer = (
         np.asarray(ur.gallery.problem("lamp", resolution=8, texture_resolution=4, reference_spp=spp).views[0].reference)
@@ -602,7 +603,7 @@ def test_a_mesh_is_given_by_its_path(given):
 
 @pytest.mark.parametrize(
     "name",
-    quick([*RENDERED, *POSES, *VOLUMES, "sphere-to-mesh"], "indirect-room", "box2", "nerf-volume"),
+    quick([*RENDERED, *POSES, *VOLUMES, "sphere-to-mesh"], "indirect-room", "box2"),
 )
 def test_equal_calls_give_equal_problems(name):
     first, second = (ur.gallery.problem(name, resolution=8, reference_spp=4) for _ in range(2))

@@ -111,6 +111,7 @@ def test_pictures_have_the_size_and_number_that_were_promised(name):
     assert problem.loss == ur.losses.L2()
 
 
+@pytest.mark.slow
 def test_what_is_unknown_has_gradients_and_is_carried(small):
     assert {key: value.shape for key, value in small.truth.items()} == UNKNOWN[small.name]
     for parameter in small.parameters:

@@ -85,6 +85,7 @@ def test_poses_are_written_into_the_scene(on_gpu: None, monkeypatch: pytest.Monk
     assert np.abs(found - np.stack(expected)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_images_of_a_pair_of_meshes_trace_one_scene_each(on_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MovedPair, "sample", lambda *_: pytest.fail("both scenes are traced in one kernel"))
     renderer = MitsubaRenderer(scene, 2, [VERTICES])

@@ -91,7 +91,7 @@ ESTIMATORS: dict[str, tuple[Any, ur.PathGradient, int]] = {
 }
 
 
-@pytest.mark.parametrize("name", quick(ESTIMATORS, "control variate", "damped", "random numbers"))
+@pytest.mark.parametrize("name", quick(ESTIMATORS, "control variate", "random numbers"))
 def test_views_of_one_launch_are_those_of_separate_launches(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     loss, estimator, count = ESTIMATORS[name]
     asked = problem(loss)

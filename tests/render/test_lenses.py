@@ -24,6 +24,7 @@ def blocks(pictures: np.ndarray) -> np.ndarray:
     return pictures.reshape(-1, 4, 4, 4, 4, 3).mean(axis=(2, 4))
 
 
+@pytest.mark.slow
 def test_the_true_heights_render_the_reference(problem: ur.Problem) -> None:
     own = blocks(np.stack([ur.render(problem, problem.truth, 0, spp=128, seed=seed) for seed in range(16)]))
     flat = blocks(ur.render(problem, {"height": np.zeros(3, np.float32)}, 0, spp=2048))[0]

@@ -106,6 +106,7 @@ def test_auto_leaves_a_start_at_which_the_sun_lights_other_faces(
     assert not any(reason.startswith("starts at other values") for reason in planted.reasons)
 
 
+@pytest.mark.slow
 def test_auto_takes_path_gradients_of_many_aims_and_perturbed_renders_of_few() -> None:
     """Two renders for each of 32 numbers cost more than one adjoint; the loss smoothed over all of them rose."""
     many, few = (lights.problem(name, views=1, seed=0, resolution=8, spp=4) for name in ("spots", "spot"))
@@ -310,6 +311,7 @@ def unknown_light(name: str) -> tuple[dict[str, Any], dict[str, Any], dict[str, 
     return {"type": "envmap", "bitmap": mi.Bitmap(picture)}, {"rotation.y": 0.5}, {"rotation.y": 0.01}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", quick(["spot", "projector", "lamp", "sky"], "sky"))
 def test_auto_recovers_the_pose_of_a_light(name: str) -> None:
     lamp, start, allowed = unknown_light(name)

@@ -114,6 +114,7 @@ def test_views_know_their_values_after_a_change_of_triangles() -> None:
     assert before[0].mean() > 5 * before[1].mean()
 
 
+@pytest.mark.usefixtures("short_ends")
 def test_a_change_of_triangles_restarts_what_is_of_the_mesh_alone() -> None:
     """In whichever part of a partition the mesh is, and not the schedule of a smoothed loss."""
     grey = mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))
@@ -144,6 +145,7 @@ class Steps(Callback):
         self.rows.append((run.state.estimator.perturbed.age, own, others))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_a_resumed_run_knows_the_true_surface_and_when_the_mesh_was_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

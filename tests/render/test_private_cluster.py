@@ -133,6 +133,7 @@ def cluster(home: Path) -> Iterator[dict[str, Any]]:
         }
 
 
+@pytest.mark.slow
 def test_it_listens_on_the_loopback_alone(cluster: dict[str, Any]) -> None:
     assert len(cluster["ports"]) >= 5, cluster["ports"]
     assert {address[-8:] for address in cluster["ports"].values()} == {"0100007F"}  # 127.0.0.1, also within IPv6
@@ -171,6 +172,7 @@ def stranger(cluster: dict[str, Any], token: str = "") -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
 def test_a_stranger_neither_reads_nor_writes_nor_joins(cluster: dict[str, Any]) -> None:
     found = stranger(cluster)

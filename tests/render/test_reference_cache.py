@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick, slow
 from unrender.backend import cache
 from unrender.gallery import specification
 from unrender.gallery.rooms import IndirectRoom
@@ -49,6 +50,7 @@ def test_a_reference_is_rendered_once(place: Path, rendered: list[int]) -> None:
     assert [path.suffix for path in place.iterdir()] == [".npz"]
 
 
+@pytest.mark.slow
 def test_each_view_is_rendered_once(place: Path, rendered: list[int]) -> None:
     """Rendering one view changes what the scene says of its sampler, and so does reading it instead of rendering it."""
     options = {"resolution": 8, "reference_spp": 8}
@@ -60,6 +62,7 @@ def test_each_view_is_rendered_once(place: Path, rendered: list[int]) -> None:
     assert len(list(place.iterdir())) == views
 
 
+@pytest.mark.slow
 def test_a_gallery_problem_takes_it_from_there(place: Path, rendered: list[int]) -> None:
     first = reference()
     found = ur.gallery.problem("indirect-room", loss="L2", **SMALL)  # the loss decides nothing of a reference
@@ -69,7 +72,8 @@ def test_a_gallery_problem_takes_it_from_there(place: Path, rendered: list[int])
 
 
 @pytest.mark.parametrize(
-    "options", [{"resolution": 9}, {"texture_resolution": 5}, {"reference_spp": 5}, {"max_depth": 3}]
+    "options",
+    quick([{"resolution": 9}, {"texture_resolution": 5}, {"reference_spp": 5}, {"max_depth": 3}], {"reference_spp": 5}),
 )
 def test_what_decides_the_reference_makes_another(place: Path, rendered: list[int], options: dict[str, int]) -> None:
     reference()
@@ -77,7 +81,7 @@ def test_what_decides_the_reference_makes_another(place: Path, rendered: list[in
     assert len(rendered) == len(list(place.iterdir())) == 2
 
 
-@pytest.mark.parametrize("damage", [b"no archive", b"cut"])
+@pytest.mark.parametrize("damage", [slow(b"no archive"), b"cut"])
 def test_a_damaged_file_is_rendered_anew_and_replaced(place: Path, rendered: list[int], damage: bytes) -> None:
     first = reference()
     (path,) = place.iterdir()
@@ -88,6 +92,7 @@ def test_a_damaged_file_is_rendered_anew_and_replaced(place: Path, rendered: lis
     assert path.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_an_array_of_another_size_is_not_used(place: Path, rendered: list[int]) -> None:
     first = reference()
     (path,) = place.iterdir()
@@ -96,6 +101,7 @@ def test_an_array_of_another_size_is_not_used(place: Path, rendered: list[int]) 
     assert len(rendered) == 2
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_where_it_is_bypassed_or_cannot_be(
     place: Path, rendered: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -194,7 +194,7 @@ CHANGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", quick(CHANGES, "a space in the scene", "the reference", "the method"))
+@pytest.mark.parametrize("name", quick(CHANGES, "a space in the scene", "the method"))
 def test_what_changed_is_shown_and_can_be_forced(wall: Path, name: str) -> None:
     folder = wall.parent / "run"
     interrupted(ur.Problem.from_file(wall), folder)
@@ -222,6 +222,7 @@ def test_other_versions_are_refused(tmp_path: Path) -> None:
     assert ur.resume(folder, force=True).steps == 8
 
 
+@pytest.mark.slow
 def test_other_options_and_missing_fields_are_refused(wall: Path) -> None:
     folder = wall.parent / "run"
     parts = ur.PathGradient(spp=2), ur.optimizers.ScheduleFree()
@@ -279,6 +280,7 @@ def test_a_plain_number_of_the_scene_counts() -> None:
     assert differences(fingerprint(made(1.5)), fingerprint(made(1.6))) == ["scene: lens has changed"]
 
 
+@pytest.mark.slow
 def test_a_problem_of_an_xml_scene_is_made_again_with_its_arrays(wall: Path) -> None:
     rng = np.random.default_rng(1)
     made = ur.Problem(

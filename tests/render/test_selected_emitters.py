@@ -139,6 +139,7 @@ def replace_depth(asked: ur.Problem, depth: int) -> ur.Problem:
     return ur.Problem(lambda: cells(3), [ur.Parameter(FLOOR)], [ur.View(reference)], max_depth=depth)
 
 
+@pytest.mark.slow
 def test_the_scene_s_sampling_weights_are_where_it_starts() -> None:
     def weighted() -> dict[str, Any]:
         scene = cells(3)
@@ -193,6 +194,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
         np.testing.assert_array_equal(result.parameters[key], value)
 
 
+@pytest.mark.slow
 def test_no_kernel_is_made_anew_after_the_warm_up() -> None:
     asked, estimator = problem(3), adaptive()
     at = asked.initial()
@@ -229,6 +231,7 @@ def test_what_cannot_take_other_probabilities_is_refused() -> None:
         session.image(moving.initial(), SampleRequest(0, 4, 0, emitters=np.array([0.3, 0.7])))
 
 
+@pytest.mark.slow
 def test_unknown_exposures_keep_it() -> None:
     """The pictures' own factors weigh what connections tell of the scene."""
     asked = problem(4)

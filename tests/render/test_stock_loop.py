@@ -52,6 +52,7 @@ def by_library(made: ur.Problem) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_loop_is_that_of_path_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     """Expressions, a world and a prior, each left out in turn as a planted fault."""
     monkeypatch.setattr(features, "_SIDE", 12)

@@ -167,6 +167,7 @@ def test_ids_with_dots_name_objects_of_files(tmp_path: Path) -> None:
     assert np.min(np.mean(pictures, axis=(2, 3, 4))) > 0.01
 
 
+@pytest.mark.slow
 def test_an_expression_of_the_rotation_turns_the_light_as_described() -> None:
     """A view that knows what an expression sets is a world; the other view has the rotation of the expression."""
     views = [ur.View(np.zeros((8, 8, 3)), known={ROTATION: TURNS[0]}), ur.View(np.zeros((8, 8, 3)))]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tiers import slow
 from unrender.backend import llvm, variant
 from unrender.core.errors import VariantError
 
@@ -212,7 +213,7 @@ def test_importing_chooses_a_safe_llvm():
 
 
 @pytest.mark.parametrize(("path", "major"), TOO_OLD)
-@pytest.mark.parametrize("call", ["use('llvm_ad_rgb')", "ensure()"])
+@pytest.mark.parametrize("call", [slow("use('llvm_ad_rgb')"), "ensure()"])
 def test_an_old_llvm_is_one_line_and_no_abort(path: str, major: int, call: str):
     answer = python(USE.format(call=call), DRJIT_LIBLLVM_PATH=path, CUDA_VISIBLE_DEVICES="")
     assert answer.returncode == 3, answer.stderr
@@ -234,7 +235,7 @@ def test_an_old_llvm_loaded_before_us_is_one_line_and_no_abort(path: str, major:
     ("name", "content", "said"),
     [
         ("libLLVM-19.so", None, "{variable} is no such file, "),
-        ("libLLVM.so", "not a library", "{variable} is not LLVM, "),
+        slow("libLLVM.so", "not a library", "{variable} is not LLVM, "),
         ("libLLVM-19.so", "not a library", "Dr.Jit cannot load {variable}, "),
     ],
 )

@@ -166,6 +166,7 @@ def test_pixels_drawn_from_all_views_are_those_of_the_views() -> None:
     assert arrays.numpy(gradient[LAMP])[0] == pytest.approx(images[views == 2, 0].sum() / 3.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_view_may_have_a_scene_and_a_film_of_its_own() -> None:
     """One paint in two rooms, of which one is dark on the right, and has a wider film."""
     other = scene(right=0.0, width=12)

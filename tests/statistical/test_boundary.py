@@ -313,6 +313,7 @@ def others() -> dict[str, tuple[dict[str, Any], str]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", quick(("mirror", "sky"), "mirror"))
 def test_other_gradients_beside_a_moving_shape_are_those_without_it(name: str) -> None:
     more, key = others()[name]

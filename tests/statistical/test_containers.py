@@ -133,6 +133,7 @@ def test_a_mesh_attribute_that_a_mirror_reads_follows_as_the_mirror_s_own_colour
     assert agree(runs(pair.previous), alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rcv", pytest.param("auto", marks=pytest.mark.slow)])
 def test_the_colour_of_a_shape_group_s_child_is_recovered(name: str) -> None:
     """The control variate's previous state has its own colour too: without it a run ends at half the right value."""

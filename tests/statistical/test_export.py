@@ -65,6 +65,7 @@ def small(name: str) -> Problem:
     return ur.gallery.problem(name, **options)
 
 
+@pytest.mark.slow
 def test_of_an_emissive_medium_there_are_the_grids(tmp_path: Path) -> None:
     problem = small("nerf-volume")
     parameters = elsewhere(problem)
@@ -206,6 +207,7 @@ def still() -> tuple[Problem, dict[str, np.ndarray]]:
     return problem, parameters
 
 
+@pytest.mark.slow
 def test_ready_made_objects_and_parameters_of_every_kind(still: Any, tmp_path: Path) -> None:
     problem, parameters = still
     done = ur.app.export(still, tmp_path / "scene")

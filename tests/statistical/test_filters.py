@@ -16,6 +16,7 @@ from test_boundary import LIMIT, block, differences, gradients, scores
 from test_camera_motion import glowing, sunlit
 from zscores import z_scores
 
+from tiers import quick
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -60,9 +61,7 @@ CASES = {
     "border": wall({"type": "gaussian"}, sample_border=True),
     "crop": wall({"type": "gaussian"}, crop_offset_x=2, crop_offset_y=1, crop_width=3, crop_height=4),
 }
-each = pytest.mark.parametrize(
-    "name", [name if name in ("gaussian", "lanczos") else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
-)
+each = pytest.mark.parametrize("name", quick(CASES, "gaussian"))
 
 
 def theirs(described: Callable[[], dict[str, Any]], shift: Any = None) -> np.ndarray:
@@ -156,6 +155,7 @@ def test_both_states_of_a_pair_are_filtered() -> None:
         np.testing.assert_allclose(np.array(images), np.array(alone), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_hidden_emitters_are_those_that_mitsuba_hides() -> None:
     def described() -> dict[str, Any]:
         found = CASES["gaussian"]()

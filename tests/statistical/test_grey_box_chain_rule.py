@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tiers import slow
 
 # An extra, of gigabytes on some systems, which `make test` does not install.
 torch: Any = pytest.importorskip("torch")
@@ -106,7 +107,7 @@ def agrees(found: np.ndarray, truth: np.ndarray, bias: float = 0.0) -> bool:
     return bool((excess <= stats.t.isf(1e-3 / (2 * truth.size), len(found) - 1) * error + 1e-9).all())
 
 
-@pytest.mark.parametrize("kind", [pytest.param("linear", marks=pytest.mark.slow), "tanh"])
+@pytest.mark.parametrize("kind", [slow("linear"), "tanh"])
 @pytest.mark.parametrize("case", [Quadratic(), Sine(), Step()], ids=lambda case: type(case).__name__)
 def test_weights_have_the_derivatives_of_the_closed_form(case: Any, kind: str) -> None:
     net = network(kind)
@@ -120,9 +121,9 @@ def test_weights_have_the_derivatives_of_the_closed_form(case: Any, kind: str) -
     "options",
     [
         {"aggregate": False},
-        {"antithetic": False},
-        pytest.param({"low_discrepancy": True}, marks=pytest.mark.slow),
-        {"epsilon": 0.5},
+        slow({"antithetic": False}),
+        slow({"low_discrepancy": True}),
+        slow({"epsilon": 0.5}),
         {"joint": True},
     ],
     ids=str,
@@ -159,6 +160,7 @@ def test_a_lost_term_is_seen() -> None:
     assert not agrees(swapped, gradient)
 
 
+@pytest.mark.slow
 def test_items_draw_independently() -> None:
     """So that the noise of a batch's mean falls with its size."""
     case = Sine()

@@ -107,12 +107,14 @@ def test_gauss_newton_gradients_are_the_slope_of_the_loss(kind: str) -> None:
     compare(kind, ur.GaussNewton(shift=0.01, derivative_spp=256), 12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", quick(("spot", "envmap"), "envmap"))
 def test_path_gradients_of_rotations_are_the_slope_of_the_loss(kind: str) -> None:
     """Light bounces between floor and ball, and the ball has shadows."""
     compare(kind, ur.PathGradient(spp=256), 32, ("rotation",))
 
 
+@pytest.mark.slow
 def test_without_the_derivative_of_sampled_environments_the_gradient_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EmitterConnection, "_turned", lambda self, emitter, radiance: radiance)
     with pytest.raises(AssertionError, match="envmap"):

@@ -80,6 +80,7 @@ def own_loop(described: dict[str, Any]) -> tuple[Any, ...]:
     return scene, parameters, optimizer, image  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
+@pytest.mark.slow
 def test_beside_three_scenes_every_kernel_is_recorded(warned: list[str], recordings: list[int]) -> None:
     alive = [mi.load_dict(with_textured_light()), own_loop(with_textured_light()), mi.load_dict(through_a_lens())]
     counts: list[int] = []
@@ -107,6 +108,7 @@ def test_one_attempt_is_enough_if_the_tables_of_all_lights_are_built(
     assert alive is not None
 
 
+@pytest.mark.slow
 def test_mini_batches_of_several_views_beside_a_lens_that_cannot_be_recorded(
     warned: list[str], recordings: list[int]
 ) -> None:

@@ -12,7 +12,7 @@ import zoo
 
 import unrender as ur
 from kernels import count_recordings
-from tiers import quick
+from tiers import quick, slow
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
@@ -191,6 +191,7 @@ def test_a_texture_that_was_black_when_paths_were_traced() -> None:
     assert abs(found.mean() / expected.mean() - 1) < 0.03
 
 
+@pytest.mark.slow
 def test_the_gradient_of_black_texels_has_their_indirect_light() -> None:
     """Against a difference on the same paths. Path replay leaves that light out: nothing is left to divide by the reflectance."""
     session, current, _ = prepared("textures")
@@ -231,7 +232,7 @@ def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pyt
         assert set(session.adjoint(current, rendering.paths, weights)) == set(current)
 
 
-@pytest.mark.parametrize("pairs", [False, True])
+@pytest.mark.parametrize("pairs", [False, slow(True)])
 def test_paths_in_use_share_a_budget(monkeypatch: pytest.MonkeyPatch, pairs: bool) -> None:
     """A loop that renders many views before its adjoints traces those that would take more."""
     session, current, previous = prepared("textures")

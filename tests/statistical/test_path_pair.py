@@ -23,6 +23,7 @@ def runs(images: tuple[Any, ...]) -> np.ndarray:
     return np.stack([np.array(image) for image in images]).astype(np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TOGETHER)
 def test_both_images_of_the_pair_agree_with_separate_renders_and_those_with_mitsuba_path(name: str) -> None:
     description, changes = subject(name)

@@ -115,6 +115,7 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
     assert np.abs(z_scores(drawn[:, ::-1], apart)).max() > 10
 
 
+@pytest.mark.slow
 def test_first_map_of_a_rough_box_is_as_good_as_that_of_the_loss_derivative() -> None:
     """Variance over that of uniform pixels, by paths that the maps have not seen: of eight first maps of each sampler."""
     box = rough_box(reference_spp=256)

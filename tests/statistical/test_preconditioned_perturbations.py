@@ -68,7 +68,9 @@ def worst(found: np.ndarray, exact: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    "options", [{}, slow({"aggregate": False}), {"order": "hvp"}, {"order": "hessian"}, {"orthogonal": True}], ids=str
+    "options",
+    [{}, slow({"aggregate": False}), slow({"order": "hvp"}), slow({"order": "hessian"}), {"orthogonal": True}],
+    ids=str,
 )
 def test_gradients_are_by_the_coordinates_of_the_descent(case: Case, options: dict[str, Any]) -> None:
     found = np.stack([e.gradient["x"].ravel() for e in estimates(case, 100, **options)]).astype(float)
@@ -83,7 +85,7 @@ def test_the_loop_does_not_apply_the_preconditioner_again(case: Case) -> None:
     np.testing.assert_array_equal(again.gradient["x"], found.gradient["x"])
 
 
-@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize("joint", [True, slow(False)])
 def test_products_are_by_the_coordinates_of_the_descent(case: Case, joint: bool) -> None:
     v = np.random.default_rng(2).standard_normal(N)
     along = {"x": v.reshape(SIDE, SIDE, 1).astype(np.float32)}
@@ -120,6 +122,7 @@ def test_perturbed_elements_move_by_sigma_in_the_mean_square(case: Case) -> None
     assert found.sigma["x"] > 1.5 * SIGMA
 
 
+@pytest.mark.slow
 def test_newtons_steps_recover_the_smooth_part(case: Case) -> None:
     """Descent along smooth perturbations, products and a line search among them: the images are met."""
     estimator = ur.SmoothedDerivatives(SIGMA, 256, order="hvp", spp=1)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tiers import quick
 from unrender import statistics
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
@@ -109,12 +110,12 @@ def steady_state_as_expected(correlation: float, fault: str | None) -> bool:
     )
 
 
-@pytest.mark.parametrize("correlation", [0.99, 0.9, 0.6])
+@pytest.mark.parametrize("correlation", quick([0.99, 0.9, 0.6], 0.9))
 def test_changing_scene(correlation):
     assert steady_state_as_expected(correlation, None)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", quick(FAULTS, "wrong lag", "last term of Eq. 10 missing"))
 def test_changing_scene_tells_faults(fault):
     assert not steady_state_as_expected(0.9, fault)
 

@@ -188,11 +188,13 @@ def gradients_agree() -> Agreement:
     return Agreement(bool(np.abs(z).max() < stats.norm.isf((1 - (1 - LEVEL) ** (1 / 3)) / 2)), f"{z}")
 
 
+@pytest.mark.slow
 def test_probabilities_of_lobes_that_depend_on_the_unknown_do_not_bias_the_gradient() -> None:
     register_adaptive()
     assert gradients_agree()
 
 
+@pytest.mark.slow
 def test_a_density_that_is_not_the_sampled_one_is_seen() -> None:
     register_adaptive(consistent=False)
     assert not gradients_agree()

@@ -16,6 +16,7 @@ from scipy import stats
 from zscores import agree, z_scores
 
 import unrender as ur
+from tiers import quick, slow
 from unrender.core.random import Key
 from unrender.estimators.base import as_numpy
 from unrender.rendering.mitsuba.integrators.boundary_sampling import _emitter_points as emitter_points
@@ -93,7 +94,8 @@ def test_with_other_probabilities_of_the_emitters_it_is_as_bright() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "space"), [(ALBEDO, "path"), (TURBIDITY, "primary"), (SUN, "primary"), (TURN, "primary")]
+    ("key", "space"),
+    [slow(ALBEDO, "path"), slow(TURBIDITY, "primary"), (SUN, "primary"), slow(TURN, "primary")],
 )
 def test_both_images_of_a_pair_agree_with_separate_renders(key: str, space: Space) -> None:
     of = renderer(key)
@@ -106,7 +108,7 @@ def test_both_images_of_a_pair_agree_with_separate_renders(key: str, space: Spac
     assert agree(np.array(pair.previous, float), stock_images(100), size=8)
 
 
-@pytest.mark.parametrize("key", [TURBIDITY, SUN, TURN])
+@pytest.mark.parametrize("key", quick([TURBIDITY, SUN, TURN], SUN))
 def test_differences_of_images_are_those_of_mitsuba_s(key: str) -> None:
     """Perturbed renders are made of these."""
     of = renderer(key)

@@ -48,6 +48,7 @@ def test_the_kernel_agrees_with_volpath(name: str) -> None:
     assert agree(runs(ours.images), volpath(renderer))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", quick([1, 2, 12], 2))
 def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
     """Roulette included: at 12 it has ended most paths."""

@@ -23,6 +23,7 @@ def pictures_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, "pictures", PICTURES)
 
 
+@pytest.mark.slow
 def test_the_same_weights_at_every_call_that_the_loss_takes(tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.pth" for number in range(3)]
     for file, seed in zip(files, (0, 0, 1), strict=True):
@@ -36,6 +37,7 @@ def test_the_same_weights_at_every_call_that_the_loss_takes(tmp_path: Path) -> N
     assert float(loss.value(0.5 * image, image).mean()) > 0.0
 
 
+@pytest.mark.slow
 def test_it_learns(tmp_path: Path) -> None:
     found = train.train(tmp_path / "w.pth", steps=40, batch=16, side=16)
     assert found["accuracy"] > 3 * found["chance"]

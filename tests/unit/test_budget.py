@@ -295,6 +295,7 @@ def test_slowdown_is_at_least_one() -> None:
     assert 1.0 <= budget.slowdown() < 1e3
 
 
+@pytest.mark.slow
 def test_a_run_that_its_budget_ends_before_a_third_step_is_told() -> None:
     found = ur.optimize(problem(), slow(0.5), ur.optimizers.Adam(0.01), seconds=0.6)
     assert found.steps < 3

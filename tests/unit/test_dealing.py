@@ -15,6 +15,7 @@ import pytest
 import unrender as ur
 from tests.contract import analytic
 from tests.local_hosts import LocalHosts
+from tiers import quick
 from unrender.app.cli.run import variant_again
 from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import assign, total
@@ -138,7 +139,7 @@ def test_sums_are_in_double_precision_and_in_order() -> None:
     assert total([{}, {}]) == {}
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", quick(ESTIMATORS, "plain", "coupled", "adaptive"))
 def test_any_number_of_shares_descends_as_one_process(name: str) -> None:
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     alone = descend(problem, name)
@@ -180,7 +181,7 @@ def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
     assert (broken.executor.traffic.repeated > 0) == (name not in ("plain", "adaptive"))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("name", ["plain", "rcv", "rcv of mini-batches"])
+@pytest.mark.parametrize("name", quick(["plain", "rcv", "rcv of mini-batches"], "rcv of mini-batches"))
 def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

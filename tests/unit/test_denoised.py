@@ -11,6 +11,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import slow
 from unrender.core.random import Key
 from unrender.images import denoising
 from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
@@ -111,13 +112,12 @@ def test_the_previous_state_is_denoised_alike() -> None:
 @pytest.mark.parametrize(
     "estimator",
     [
-        pytest.param(lambda by: ur.PathGradient(Denoised(by=by), spp=4), id="plain"),
-        pytest.param(
-            lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=2), id="control variate", marks=pytest.mark.slow
-        ),
-        pytest.param(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=1), id="own paths", marks=pytest.mark.slow),
-        pytest.param(lambda by: ur.MetaEstimator(coupled=True, spp=2, image=Denoised(CV(), by=by)), id="coupled"),
+        lambda by: ur.PathGradient(Denoised(by=by), spp=4),
+        slow(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=2)),
+        slow(lambda by: ur.PathGradient(Denoised(CV(), by=by), spp=1)),
+        slow(lambda by: ur.MetaEstimator(coupled=True, spp=2, image=Denoised(CV(), by=by))),
     ],
+    ids=["plain", "control variate", "own paths", "coupled"],
 )
 @pytest.mark.parametrize("by", ["variation", OIDN])
 def test_a_descent_comes_near_the_truth(estimator: Any, by: Any) -> None:
@@ -161,6 +161,7 @@ def test_what_makes_no_sense_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
         ur.estimate(problem(), ur.PathGradient(Denoised(by="oidn")))
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_mitsuba_images_too() -> None:
     """On the device: image, adjoint and memory of a path-traced scene."""

@@ -329,6 +329,7 @@ def textured(shift: float, noise: float, count: int = 2) -> Problem:
     return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given, truth=truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "told"), [(0.25, True), slow(0.0, False)])
 def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_paths(
     shift: float, told: bool, tmp_path: Path

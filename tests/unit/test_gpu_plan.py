@@ -93,6 +93,7 @@ def test_what_ended_is_not_run_again(folder: Folder, tmp_path: Path, monkeypatch
     assert folder.is_next(part)
 
 
+@pytest.mark.slow
 def test_a_slice_over_its_minutes_is_cut_short_and_goes_on(
     folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +160,7 @@ def test_last(): pass
 """
 
 
+@pytest.mark.slow
 def test_tests_go_on_after_the_process_has_ended(tmp_path: Path) -> None:
     (tmp_path / "test_some.py").write_text(TESTS)
     (tmp_path / "fatal").touch()

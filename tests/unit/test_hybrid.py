@@ -103,6 +103,7 @@ def worst(rows: np.ndarray, mean: np.ndarray) -> float:
     return float(np.abs((rows.mean(0) - mean) / (rows.std(0, ddof=1) / np.sqrt(len(rows)))).max())
 
 
+@pytest.mark.slow
 def test_both_parts_are_unbiased() -> None:
     """Loss and image are quadratic and linear, so the smoothed gradient is the gradient; with the loss of noisy images it is not."""
     asked, at = problem(), problem().initial()

@@ -82,6 +82,7 @@ def test_numbers_beside_other_unknowns_have_means_without_errors() -> None:
     assert not isinstance(block, Measuring)  # a block's own errors take the other unknowns as known
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_short_means_beside_control_variates_have_no_standard_errors() -> None:
     """Their noise is that of a few memories: a roughness of 0.2080 ± 0.0020 was 0.2."""

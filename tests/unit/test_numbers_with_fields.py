@@ -12,6 +12,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import slow
 from unrender.runs import field_directions, final_images, least_squares
 from unrender.runs.field_directions import _Adjoints
 from unrender.runs.least_squares import NumbersCheck, check_numbers
@@ -139,7 +140,7 @@ def assert_no_error_is_stated(made: ur.Problem, found: NumbersCheck, keys: tuple
     assert not found.standard_errors(values)
 
 
-@pytest.mark.parametrize("seconds", [0.3, 1.0])
+@pytest.mark.parametrize("seconds", [0.3, slow(1.0)])
 def test_numbers_with_a_texture_that_there_was_no_time_to_move(monkeypatch: pytest.MonkeyPatch, seconds: float):
     made, _ = with_a_texture(0.9)
     values, prepare = at_truth(made), _Adjoints.__init__
@@ -154,6 +155,7 @@ def test_numbers_with_a_texture_that_there_was_no_time_to_move(monkeypatch: pyte
     assert_no_error_is_stated(made, found, ("a", "b"), "whether a, b converged: the run is too short for this test")
 
 
+@pytest.mark.slow
 def test_numbers_with_a_texture_that_there_was_time_to_move_once_only(monkeypatch: pytest.MonkeyPatch):
     """One round of directions states .57 of the error."""
     made, _ = with_a_texture(0.99)

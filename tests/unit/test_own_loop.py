@@ -92,7 +92,7 @@ def worst_z(rows: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
     return float(np.abs(z).max()), float(stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2))
 
 
-QUICK = ("two groups", "control variate, two groups", "uniform pixels, control variate")
+QUICK = ("two groups", "control variate, two groups")
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in OPTIONS])

@@ -11,6 +11,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import slow
 from unrender.estimators import GaussNewton, PathThenNewton
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Hessian, HessianNoise
@@ -97,7 +98,7 @@ def test_a_plan_in_a_file_makes_the_same_run_and_a_run_resumes_to_the_bit(tmp_pa
         np.testing.assert_array_equal(ended.parameters["gain"], whole.parameters["gain"])
 
 
-@pytest.mark.parametrize(("noise", "wait"), [(2.5, 2.5), (1e3, 16.0), (np.nan, 16.0)])
+@pytest.mark.parametrize(("noise", "wait"), [(2.5, 2.5), slow(1e3, 16.0), slow(np.nan, 16.0)])
 def test_derivative_images_that_are_noise_leave_path_gradients(
     monkeypatch: pytest.MonkeyPatch, noise: float, wait: float
 ) -> None:

@@ -12,6 +12,7 @@ from test_photographs_parameters import check_adjoint, requests
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from tiers import slow
 from unrender.app.capture import pictures, unknowns
 from unrender.core.errors import InputError
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, scene_values, with_photographs
@@ -144,7 +145,7 @@ def test_with_unknown_exposures_it_is_refused() -> None:
     assert not scene_values(renderer, {RESPONSE: GIVEN})
 
 
-@pytest.mark.parametrize("fault", [False, True])
+@pytest.mark.parametrize("fault", [False, slow(True)])
 def test_a_response_is_recovered_beside_what_the_scene_holds(fault: bool) -> None:
     """From pictures of several radiances, to 2 % of radiance; not where another curve, an offset, was planted."""
     rng = np.random.default_rng(4)

@@ -103,6 +103,7 @@ def test_the_page_holds_meshes_and_a_picture_of_them(tmp_path: Path, monkeypatch
     assert "too large to be shown" in large.note
 
 
+@pytest.mark.slow
 def test_meshes_turn_or_are_a_picture(tmp_path: Path) -> None:
     path = report.page(written(tmp_path / "run"))
     with chromium() as page:

@@ -10,7 +10,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
-from tiers import quick
+from tiers import quick, slow
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.runs import loop
@@ -67,7 +67,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
 }
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, slow(False)])
 @pytest.mark.parametrize("name", quick(ESTIMATORS, "path", "hybrid"))
 def test_texels_beside_saturated_ones_are_not_led_astray(
     name: str, known: bool, monkeypatch: pytest.MonkeyPatch
@@ -88,7 +88,7 @@ def test_texels_beside_saturated_ones_are_not_led_astray(
     assert error < (0.08 if name == "smoothed" else 0.03) if known else error > 0.2
 
 
-@pytest.mark.parametrize(("name", "most"), [("path", 0.002), ("coupled", 0.01), ("smoothed", 0.003)])
+@pytest.mark.parametrize(("name", "most"), [("path", 0.002), ("coupled", 0.01), slow("smoothed", 0.003)])
 def test_noise_does_not_move_texels_from_their_bounds(name: str, most: float) -> None:
     """Where the minimum is at the bound: if the present gradient held elements, only its inward noise would pass."""
     wanted = np.ones((12, 12, 1))

@@ -12,7 +12,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
-from tiers import slow
+from tiers import quick, slow
 from unrender.estimators import fresh_pictures
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.base import leave_one_out
@@ -74,6 +74,7 @@ class Away:
         return {key: value * 0 + self.pace for key, value in parameters.items()}, state + 1
 
 
+@pytest.mark.slow
 def test_a_loss_within_the_noise_of_few_paths_is_judged_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = made(start=None, noise=8.0)
     found = ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40)
@@ -254,11 +255,12 @@ def test_a_shared_part_is_measured() -> None:
 @pytest.mark.parametrize(
     "estimator",
     [
-        pytest.param(ur.PathGradient(spp=4), id="plain"),
-        pytest.param(RCV, id="control variate"),
-        pytest.param(replace(RCV, pixels=ur.pixels.Uniform(32)), id="control variate of mini-batches"),
-        pytest.param(ur.MetaEstimator(), id="meta"),
+        slow(ur.PathGradient(spp=4)),
+        RCV,
+        slow(replace(RCV, pixels=ur.pixels.Uniform(32))),
+        slow(ur.MetaEstimator()),
     ],
+    ids=["plain", "control variate", "control variate of mini-batches", "meta"],
 )
 def test_runs_that_succeed_are_finished(estimator: Any, count: int) -> None:
     for seed in range(count):
@@ -338,7 +340,7 @@ class WrongWeight(RecursiveControlVariate):
         return super()._combine_view(memory, wrong, asked, frame)
 
 
-@pytest.mark.parametrize("factor", [0.9, 0.97, 1.1])
+@pytest.mark.parametrize("factor", quick([0.9, 0.97, 1.1], 0.97))
 def test_a_memory_with_a_wrong_weight_disagrees(factor: float) -> None:
     for seed in range(3):
         estimator = ur.PathGradient(image=WrongWeight(factor=factor), spp=4)
@@ -416,7 +418,7 @@ def test_pixels_are_drawn_where_there_are_many() -> None:
     assert result.status == "finished"
 
 
-@pytest.mark.parametrize(("views", "share"), [(1, 0.0), slow(30, 0.0), (30, 1.0)])
+@pytest.mark.parametrize(("views", "share"), [(1, 0.0), slow(30, 0.0), slow(30, 1.0)])
 def test_pictures_of_other_pixels_are_not_subtracted(views: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the end of a run that stands still, other or more pixels are rendered than before, unless both pictures have all."""
     fresh: list[Any] = []
@@ -456,7 +458,7 @@ def noting(problem: ur.Problem, offset: float = 0.5, noise: float = 0.5) -> tupl
     return problem.with_parts(renderer=renderer), renderer.forms
 
 
-@pytest.mark.parametrize(("views", "form"), [(1, (16, None)), (30, (4, 1024))])
+@pytest.mark.parametrize(("views", "form"), [(1, (16, None)), slow(30, (4, 1024))])
 def test_all_pictures_of_a_short_run_have_one_form(views: int, form: Any) -> None:
     """The start, two candidates and the end: kernels are compiled once, and no parameters are rendered twice."""
     problem, forms = noting(made(views=views))
@@ -498,7 +500,7 @@ def smooth(offset: float, seed: int, known: bool = True) -> ur.Problem:
 UNEXPLAINED = "no longer improves"
 
 
-@pytest.mark.parametrize("estimator", [ur.PathGradient(spp=4), RCV], ids=["plain", "control variate"])
+@pytest.mark.parametrize("estimator", [ur.PathGradient(spp=4), slow(RCV)], ids=["plain", "control variate"])
 def test_light_that_no_unknown_explains_is_told(estimator: Any) -> None:
     for seed in range(2):
         result = ur.optimize(smooth(0.5, seed), estimator, ur.optimizers.Adam(0.02), steps=300, seed=seed)
@@ -516,7 +518,7 @@ def test_references_without_a_known_truth_may_differ_by_a_quarter_as_photographs
 
 
 @pytest.mark.parametrize("count", [3, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("rate", [0.02, 0.2])
+@pytest.mark.parametrize("rate", [slow(0.02), 0.2])
 def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: int) -> None:
     for seed in range(count):
         result = ur.optimize(smooth(0.0, seed), RCV, ur.optimizers.Adam(rate), steps=200, seed=seed)
@@ -639,8 +641,8 @@ def tiny(side: int, start: float, seed: int, grain: float = 0.0, known: bool = T
     return ur.Problem(renderer, [ur.Parameter("x")], views, truth={"x": truth} if known else None)
 
 
-@pytest.mark.parametrize("side", [1, 2, 5, 9])
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("side", quick([1, 2, 5, 9], 2, 9))
+@pytest.mark.parametrize("known", [False, slow(True)])
 def test_a_local_minimum_of_few_pixels_is_told(side: int, known: bool) -> None:
     """From below the maximum at -1 the descent ends there."""
     for seed in range(2):
@@ -652,7 +654,7 @@ def test_a_local_minimum_of_few_pixels_is_told(side: int, known: bool) -> None:
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("grain", "known"), [(0.0, False), (0.05, False), (0.0, True), (0.3, True)])
+@pytest.mark.parametrize(("grain", "known"), [slow(0.0, False), (0.05, False), slow(0.0, True), (0.3, True)])
 @pytest.mark.parametrize("side", [1, 4])
 def test_few_pixels_that_have_converged_have_nothing_unexplained(
     side: int, grain: float, known: bool, count: int
@@ -937,7 +939,7 @@ def test_a_difference_that_changes_its_sign_within_tiles_is_told(axis: int, samp
 
 
 @pytest.mark.parametrize(
-    ("side", "size", "count"), [(24, 0.05, 40), (48, 0.05, 40), (128, 0.2, 6), (256, 0.1, 3), (256, 0.2, 3)]
+    ("side", "size", "count"), [(24, 0.05, 40), slow(48, 0.05, 40), slow(128, 0.2, 6), slow(256, 0.1, 3), (256, 0.2, 3)]
 )
 def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side: int, size: float, count: int) -> None:
     """The score of a correlation grows with the root of the number of pixels, so that one of 0.018 shows in large pictures."""
@@ -991,8 +993,8 @@ def test_the_status_reads_the_size_of_a_difference(error: float, status: str) ->
         assert verification.fit_status(made(), "finished", differs, few=False) == "does not fit"
 
 
-@pytest.mark.parametrize("steps", [20, 60, 150])
-@pytest.mark.parametrize("deviation", [0.01, 0.03])
+@pytest.mark.parametrize("steps", [20, 60, slow(150)])
+@pytest.mark.parametrize("deviation", [slow(0.01), 0.03])
 def test_few_numbers_with_a_strong_prior_end_as_finished_after_any_number_of_steps(
     deviation: float, steps: int, tmp_path: Path
 ) -> None:
@@ -1100,7 +1102,7 @@ def test_arrays_of_an_earlier_end_do_not_outlast_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.mitsuba
-@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("folder", [slow(False), True])
 def test_no_reference_differs_from_pictures_whose_loss_has_none(folder: bool, tmp_path: Path) -> None:
     """The references of a function of the image alone are placeholders."""
     import drjit as dr
