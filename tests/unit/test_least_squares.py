@@ -393,6 +393,26 @@ def test_a_rare_bright_sample_that_hides_a_slope_leaves_its_number_without_a_sta
         assert not found.noisy(("b",))
 
 
+def test_noise_of_the_test_leaves_no_number_open_of_which_the_run_knows_the_error(monkeypatch: Any):
+    """Radiances of lamps that the run knew to a percent were "determined to ± 8.02 or more", since a short test did not see a slope."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    slopes, rng = 0.1 * MATRIX.T.reshape(4, -1, 3), np.random.default_rng(1)
+    one, other = slopes + np.array([0.0, 0.0, 0.0, 1.0])[:, None, None] * rng.normal(size=(2, *slopes.shape))
+    residuals = np.tile(rng.normal(0.0, 0.5, slopes.shape[1:]), (2, 1, 1))
+    residuals[1, 0] += 0.1
+    for settled in (np.zeros(4, bool), np.arange(4) == 3):
+        of = dataclasses.replace(numbers, settled=settled)
+        fit = _Fit.of(of, Differences(np.diag([0.1, 0.1, 0.1, 0.25]), one, other), residuals)
+        found = _checked(of, fit, np.full(4, 0.01))
+        assert ("b" in found.undetermined) == (not settled.any())
+    seen: list[np.ndarray] = []
+    monkeypatch.setattr(least_squares, "_check", lambda of, *_: seen.append(of.settled) or NumbersCheck())
+    check_numbers(made, TRUTH, made.initial_values(), FAR, known={"a": np.array([0.01, 0.2, np.inf])})
+    assert seen[0].tolist() == [True, False, False, False]
+
+
 SIDE = 24
 
 

@@ -268,15 +268,15 @@ def _undetermined(
 
     seconds = min(max(_LOOK_SHARE * seconds_of_steps(result), _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
-    per_pass = _pass_spp(problem)
+    per_pass, stated = _pass_spp(problem), result.standard_error
     lines += common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
     of_numbers = allowed
     if timing.counts():
         of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
-    numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights)
-    deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
+    numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights, stated)
+    deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     limits = within(seconds), per_pass, within(most), sensitivities, deviations, path_seconds
     lines += undetermined(problem, result.parameters, spp, *limits)
@@ -287,7 +287,7 @@ def _undetermined(
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])
-        lines += numbers.noisy(result.standard_error)
+        lines += numbers.noisy(stated)
     elif numbers.distorted:
         lines.append(numbers.distorted)
     failed = result.status == "failed"  # such a run did not end by its budget

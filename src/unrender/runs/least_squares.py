@@ -63,6 +63,7 @@ def check_numbers(
     seconds: float,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
     weights: Sequence[np.ndarray] = (),
+    known: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> NumbersCheck:
     """Test the problem's numbers by least squares at `values`.
 
@@ -83,13 +84,15 @@ def check_numbers(
         seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
         weights: weights of each view's pixels in the run's steps (`pixel_weights`); () if equal. A fit with others has another solution.
+        known: {key: standard errors} that the run states. Where they are small, noise of this check leaves no number undetermined.
     """
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
         return NumbersCheck()
     if (affordable := numbers.affordable(_PASSES + 1, seconds if timing.counts() else math.inf)) is None:
         return NumbersCheck(unchecked=numbers.keys)
-    numbers = replace(affordable, weights=weights)
+    stated = np.concatenate([np.ravel(known.get(k, np.full(values[k].size, math.inf))) for k in affordable.keys])
+    numbers = replace(affordable, weights=weights, settled=stated < _DOUBTFUL * affordable.sizes)
     try:
         return _of_tested_views(_check(numbers, sensitivities, timing.now() + seconds), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
@@ -290,7 +293,7 @@ class _Fit:
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
-        open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
+        open_ = flat[None] | (~(numbers.rigid | numbers.settled)[:, None] & comparable)
         unseen = changes[:n] * (hidden[None] & open_)
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)

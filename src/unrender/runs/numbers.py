@@ -87,6 +87,7 @@ class Numbers:
         spp: samples per pixel of a picture.
         fields: {key: (k, *shape)}, directions of textures and grids.
         weights: weights of each view's pixels in addition to the views' weights, (H, W, 1) or (H, W, 3); () for equal ones.
+        settled: whether the run states a small standard error of a number, (n,).
     """
 
     problem: Problem
@@ -101,6 +102,7 @@ class Numbers:
     spp: int
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
     weights: Sequence[np.ndarray] = ()
+    settled: np.ndarray | bool = False
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
