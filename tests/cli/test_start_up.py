@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import unrender
 
 PROGRAM = """
@@ -32,6 +34,18 @@ from unrender.app.cli.main import main
 for file in {files!r}:
     assert main(["run", file]) == 2
 print(*sorted(sys.modules))
+"""
+
+
+BEGAN = """
+import sys, time
+before = time.perf_counter()
+while time.perf_counter() - before < 0.3:
+    pass
+sys.argv[1:] = ["run", "wall"]
+from unrender.app.cli import app, main
+app.app = lambda *words, obj, **options: print(obj[0] < before, end="")
+main.main()
 """
 
 
@@ -87,3 +101,9 @@ def test_a_bad_problem_file_is_told_before_what_takes_long_to_import(tmp_path: P
     files[2].write_text('scene = "none.xml"\n[[parameters]]\n[[views]]\n')
     late = {"unrender.methods", "unrender.runs.optimize", "unrender.gallery", "mitsuba", "scipy.special"}
     assert not imported(COMPLAINT.format(files=[str(file) for file in files])) & late
+
+
+@pytest.mark.skipif(not Path("/proc/thread-self/schedstat").exists(), reason="needs Linux")
+def test_the_budget_of_a_command_begins_with_its_process() -> None:
+    """On a loaded machine, 2 to 4 s of imports came before it."""
+    assert imported(BEGAN) == {"True"}

@@ -91,6 +91,27 @@ def test_a_budget_may_cover_more_than_the_steps(
     assert result.steps == steps
 
 
+@pytest.mark.parametrize(("pause", "resumed", "steps"), [(0.1, False, 2), (0.9, False, 1), (0.9, True, 2)])
+def test_a_long_step_warms_up_once(pause: float, resumed: bool, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a step of 8 s, whose kernels were known, two came before the first one of a budget of 15 s. A resumed run compares two states."""
+    now, paused = [100.0], []
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: (paused.append(seconds), now.__setitem__(0, now[0] + seconds)))
+    run = loop.prepare(Plan(problem(), slow(pause), ur.optimizers.Adam(0.01)), None, 4.0, 0)
+    run.begin_budget(now[0])
+    run.description |= {"resumed": []} if resumed else {}
+    seconds, _ = loop.warm_up(run)
+    assert (len(paused), seconds, run.trial[0]) == (steps, pytest.approx(steps * pause), pytest.approx(pause))
+
+
+@pytest.mark.parametrize(("slower", "left", "tested"), [(1.0, 9.0, True), (1.0, 6.0, False), (9.0, 9.0, False)])
+def test_tests_at_the_end_need_time_on_this_machine(slower: float, left: float, tested: bool) -> None:
+    """Beside ten other jobs, tests took 11 s of a budget of 15 s, whose steps had 6."""
+    run = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), None, 10.0, 0)
+    run.deadline, run.trial = time.perf_counter() + left, (0.3 * slower, 16 * 8)
+    assert budget.can_test(run) is tested
+
+
 def test_advice_on_few_steps_suits_the_run() -> None:
     assert budget.few_steps(4.0, 3, spp=16, large=True).endswith(
         "; use more seconds, fewer samples (--set spp=4), a smaller picture (resolution), or fewer pixels a step (--set pixels=4096)"
@@ -101,6 +122,7 @@ def test_advice_on_few_steps_suits_the_run() -> None:
     assert budget.few_steps(4.0, 3, spp=2).endswith("; use more seconds or a smaller picture (resolution)")
     assert not budget.few_steps(4.0, 20, spp=16)
     assert "; use at least 13 seconds or a smaller picture" in budget.few_steps(4.0, 3, enough=12.1)
+    assert "about 3 steps after 2 s of loading and compiling; use" in budget.few_steps(4.0, 3, before=1.8)
 
 
 @pytest.mark.parametrize(

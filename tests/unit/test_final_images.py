@@ -806,3 +806,13 @@ def test_highlights_do_not_make_all_other_pixels_unchanged(every: int) -> None:
         little = final_checks._is_little(image, change, np.ones(4096))
         assert little[:2048].all()
         assert not little[2048:].any()
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_no_probe_is_made_that_ends_after_the_budget(late: bool) -> None:
+    """At least one was made, which took 6 s of a loaded machine after a budget of 15 s was over."""
+    made = problem()
+    result = Result({"wall": np.full(3, 0.5, np.float32)}, made.initial_values(), [{"samples": 8}], 1.0, 0.0, "seconds")
+    found = final_images.render_final_images(made, result, 8, left=lambda: -1.0, grace=1.0 if late else 3.0)
+    assert bool(found.sensitivity) is not late
+    assert any(TOO_SHORT in line for line in found.undetermined) is late

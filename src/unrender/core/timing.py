@@ -27,6 +27,16 @@ def counting(counts: bool = True) -> Iterator[None]:
         _spent.reset(token)
 
 
+def scheduled(thread: str = "/proc/thread-self") -> tuple[float, float]:
+    """Return the seconds that a thread, by default this one, has computed and has waited for a processor; zeros if unknown."""
+    try:
+        with open(f"{thread}/schedstat") as file:
+            ran, waited, _ = (1e-9 * int(word) for word in file.read().split())
+    except (OSError, ValueError):
+        return 0.0, 0.0
+    return ran, waited
+
+
 def counts() -> bool:
     """Return whether renderings are counted."""
     return _spent.get() is not None

@@ -8,12 +8,15 @@ import time
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from unrender.backend import cache
 from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs.callbacks import Callback
+from unrender.runs.image_sensitivity import seconds_of_probe
 from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.truth_check import FEW_NEWTON_STEPS
 
@@ -24,12 +27,16 @@ _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
 _LEAST_SPP, _FEW_PIXELS = 2, 4096  # least samples per pixel, and pixels per step, that it advises
-_END_SHARE, _END_SECONDS = 0.1, 1.0
-"""Time reserved for verification and final images: a fraction of the budget, plus seconds."""
+_END_SHARE, _END_UNTESTED, _END_SECONDS = 0.1, 0.05, 1.0
+"""Time reserved for verification and final images: a fraction of the budget, less without tests, plus seconds."""
+_TESTED_SHARE, _OF_TESTS = (0.7, 0.3), 1 / 9
+"""Share of the budget that must be left after the warm-up for tests of what the images determine, less if kernels were compiled; and
+largest share of the time left for one probe of the images' sensitivity, of which the tests take three at least."""
 _LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
 """Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
-_LEAST_SHARE = 0.5
-"""Fraction of the budget that the steps get even if the warm-up takes long, within the following limits."""
+_LEAST_SHARE, _LONG_BEFORE = 0.5, 1 / 3
+"""Fraction of the budget that the steps get even if the warm-up takes long, within the following limits; and fraction before the first step
+that a line names."""
 _LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
 """Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
 _PAGE_SECONDS = 1.0  # time of the page and the summary on an idle machine
@@ -55,9 +62,10 @@ class Budget(Callback):
             run.deadline -= run.clock  # of a resumed run, before
         self._least = time.perf_counter() + _LEAST_SHARE * max((run.seconds or 0.0) - run.clock, 0.0)
         if run.deadline is not None and run.seconds is not None:
+            run.before = max(time.perf_counter() - (run.deadline - run.seconds) - run.clock, 0.0)
             late = _LATE_COMPILED if run.compiled else _LATE_SHARE * run.seconds + _LATE_SECONDS
-            rest = (_END_SHARE * run.seconds + _END_SECONDS + _PAGE_SECONDS) * min(slowdown(), MOST_SLOWDOWN)
-            self._least = min(self._least, run.deadline + late - rest)
+            run.grace = max(late - _PAGE_SECONDS * min(slowdown(), MOST_SLOWDOWN), 0.0)
+            self._least = min(self._least, run.deadline + run.grace - _end(run))
         self._check(run)
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
@@ -85,8 +93,13 @@ class Budget(Callback):
         if run.deadline is None or run.seconds is None or now - self._looked < _LOOK_SECONDS:
             return
         self._looked = now
-        end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), MOST_SLOWDOWN), 0.5 * run.seconds)
-        run.last_step = max(run.deadline - end, self._least)
+        run.last_step = max(run.deadline - min(_end(run), 0.5 * run.seconds), self._least)
+
+
+def _end(run: Run) -> float:
+    """Return the seconds reserved for verification, final images and tests."""
+    share = _END_SHARE if run.tested else _END_UNTESTED
+    return (share * (run.seconds or 0.0) + _END_SECONDS) * min(slowdown(), MOST_SLOWDOWN)
 
 
 def slowdown() -> float:
@@ -94,15 +107,18 @@ def slowdown() -> float:
     renderings are counted."""
     if timing.counts():
         return 1.0
-    running = waiting = 0
-    for path in glob.glob("/proc/self/task/*/schedstat"):
-        try:
-            with open(path) as file:
-                ran, waited, _ = (int(word) for word in file.read().split())
-        except (OSError, ValueError):
-            continue
-        running, waiting = running + ran, waiting + waited
+    running, waiting = np.sum([(0.0, 0.0), *map(timing.scheduled, glob.glob("/proc/self/task/*"))], axis=0).tolist()
     return 1.0 + waiting / running if running else 1.0
+
+
+def can_test(run: Run) -> bool:
+    """Return whether a budget in seconds has time for tests at the end, by the time that a step of the warm-up took."""
+    if run.seconds is None:
+        return True
+    seconds, samples = run.trial
+    probe = seconds_of_probe(run.problem, seconds, _cost_of_steps(samples, 1), 1)
+    slow = not run.compiled and probe > _OF_TESTS * run.time_left()
+    return run.time_left() > _TESTED_SHARE[run.compiled] * run.seconds and not slow
 
 
 def seconds_of_steps(result: Result) -> float:
@@ -134,7 +150,7 @@ def _warn_of_few_steps(run: Run) -> None:
     needed = FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else _FEW_STEPS
     spp, large = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
     spp, steps = spp if isinstance(spp, int) else None, max(expected, run.step)
-    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run, needed), needed)
+    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run, needed), needed, run.before)
     run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
     run.few_steps = line
 
@@ -144,9 +160,8 @@ def _enough(run: Run, needed: int) -> float:
     steps = needed * run.clock / run.step
     if run.deadline is None or run.seconds is None:
         return steps
-    before = max(time.perf_counter() - (run.deadline - run.seconds) - run.clock, 0.0)
     busy = min(slowdown(), MOST_SLOWDOWN)
-    return min((before + steps + busy * _END_SECONDS) / (1.0 - busy * _END_SHARE), 2.0 * (before + steps))
+    return min((run.before + steps + busy * _END_SECONDS) / (1.0 - busy * _END_SHARE), 2.0 * (run.before + steps))
 
 
 def few_steps(
@@ -157,6 +172,7 @@ def few_steps(
     large: bool = False,
     enough: float | None = None,
     needed: int = _FEW_STEPS,
+    before: float = 0.0,
 ) -> str:
     """Return a line with advice if a budget allows fewer than `needed` steps and fewer than `most`; else "".
 
@@ -167,6 +183,7 @@ def few_steps(
         large: whether the views have more pixels than the number that it advises per step.
         enough: seconds that the needed steps need; None if unknown.
         needed: number of steps; Gauss-Newton steps of all unknowns need fewer.
+        before: seconds of the budget before the first step.
     """
     if steps >= min(needed, most or needed):
         return ""
@@ -177,7 +194,8 @@ def few_steps(
     if large:
         ways.append(f"fewer pixels a step (--set pixels={_FEW_PIXELS})")
     advice = ", ".join(ways[:-1]) + (", or " if len(ways) > 2 else " or ") + ways[-1]
-    return f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}; {advice}"
+    late = f" after {before:.0f} s of loading and compiling" if before > _LONG_BEFORE * seconds else ""
+    return f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}{late}; {advice}"
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

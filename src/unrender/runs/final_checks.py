@@ -13,7 +13,7 @@ from unrender.display import formatting
 from unrender.estimators.penalties import penalty
 from unrender.runs.determination import changed
 from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
-from unrender.runs.folder.schema import MISFIT
+from unrender.runs.folder.schema import MISFIT, WORSE
 from unrender.runs.reference_distortions import AS_IF, distortions
 from unrender.runs.result import Result
 from unrender.runs.verification import (
@@ -117,6 +117,19 @@ def _worse(measure: str, after: float, before: float) -> str:
     return (
         f"the final picture is worse than the initial one: {measure} {formatting.number(after)}, {formatting.number(before)} at the start; "
         "the result holds the initial parameters; try a lower learning_rate, more samples per pixel, or another method"
+    )
+
+
+def at_start(result: Result, rise: str) -> Result:
+    """Return a result with the initial parameters, which final images have found to be better, and the warning about it."""
+    verification = {name: value for name, value in result.verification.items() if name != "change"}
+    verification |= {"status": WORSE, "best": "start", "best_loss": verification["start"]}
+    return replace(
+        result,
+        parameters=dict(result.initial),
+        standard_error={},
+        verification=verification,
+        warnings=[*result.warnings, rise],
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -29,8 +29,7 @@ from unrender.runs.final_checks import (
     rise,
     unexplained_pixels,
 )
-from unrender.runs.folder.schema import WORSE
-from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
+from unrender.runs.image_sensitivity import Curvature, curvature, map_keys, seconds_of_probe
 from unrender.runs.joint_maps import blurred_cells, hidden_changes, untested_changes
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_fit import no_better_maps
@@ -61,22 +60,18 @@ and up to 90 x 90 pixels it takes 1.5. Otherwise the minimum is a second."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
-_PICTURES_SHARE = 0.5
+_PICTURES_SHARE, _MOST_CHECK = 0.5, 1.25
 """Share of the time that is left at the end that final pictures may take with the check of unchanged pixels, and of what is left then that
-this check may take."""
-_MOST_CHECK = 1.25
-"""Most time of this check, relative to that of the pictures, that is set aside by rendering fewer samples."""
+this check may take; its most time, relative to that of the pictures, that is set aside by rendering fewer samples."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
-_NOT_TESTED = "the end of the run was not tested, or had no time left"
-"""Reason for no standard errors of textures and grids."""
+_NOT_TESTED = "the end of the run was not tested, or had no time left"  # for standard errors of textures and grids
 _SEEDS = {"initial": 1, "result": 2}
 _HALVES = 2 * len(_SEEDS)
 _FEWEST_SAMPLES = 8
 """Fewest samples per pixel of a half with which `unexplained_pixels` judges: of fewer, most pixels miss the rare bright paths."""
-_SECOND_HALF = 1 << 16
-"""Offset of the seed for the second half of an image's samples."""
+_SECOND_HALF = 1 << 16  # offset of the seed for the second half of an image's samples
 
 
 @dataclass(frozen=True)
@@ -124,6 +119,7 @@ def render_final_images(
     tested: bool = True,
     weights: Sequence[np.ndarray] = (),
     complete: bool = False,
+    grace: float = math.inf,
 ) -> FinalImages:
     """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
@@ -137,6 +133,7 @@ def render_final_images(
         tested: whether to estimate sensitivities and to test what the images determine.
         weights: weights of each view's pixels in the run's steps, see `least_squares.pixel_weights`.
         complete: whether the standard errors of the result contain the references' noise.
+        grace: further seconds within which the first probe of the sensitivity must end; without them nothing is tested.
     """
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
@@ -147,6 +144,7 @@ def render_final_images(
             return FinalImages(pictures, errors, samples, {}, rise=risen)
         tests = max(left(), 0.0 if timing.counts() else _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 0.5 * tests)
+        tested = tested and seconds_of_probe(problem, spent, timing.cost(paths, 4 * len(chosen)), 2) < left() + grace
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
@@ -158,13 +156,10 @@ def render_final_images(
         still = None if differs else differs_still(problem, result, chosen, ends, samples)
         fits = not differs and (still is None or NOISE in still.causes)
         if not tested and result.steps and not differs:
-            late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
-            deviations = _without(deviations, late.unchecked)
-            lines = [*untested_factor(problem), *untested_changes(problem), *untested_cells(problem), *late.missing()]
+            lines, deviations = _left_out(problem, result)
         if everything:
-            lines, warnings, deviations, unseen = _undetermined(
-                problem, result, known, left, tests, spent / paths, weights, fits=fits, complete=complete
-            )
+            given = problem, result, known, left, tests, spent / paths, weights
+            lines, warnings, deviations, unseen = _undetermined(*given, fits=fits, complete=complete)
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
             if halves and left() > 0.0:
@@ -183,17 +178,11 @@ def _named_once(lines: Sequence[str], differs: Misfit | None) -> list[str]:
     return [line for line in lines if not (differs and AS_IF in differs.line and AS_IF in line)]
 
 
-def at_start(result: Result, rise: str) -> Result:
-    """Return a result with the initial parameters, which final images have found to be better, and the warning about it."""
-    verification = {name: value for name, value in result.verification.items() if name != "change"}
-    verification |= {"status": WORSE, "best": "start", "best_loss": verification["start"]}
-    return replace(
-        result,
-        parameters=dict(result.initial),
-        standard_error={},
-        verification=verification,
-        warnings=[*result.warnings, rise],
-    )
+def _left_out(problem: Problem, result: Result) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return lines about tests that are left out, and the standard errors that need none of them."""
+    late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
+    lines = [*untested_factor(problem), *untested_changes(problem), *untested_cells(problem), *late.missing()]
+    return lines, _without(result.standard_error, late.unchecked)
 
 
 def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:

@@ -339,16 +339,28 @@ def adjoints(
     """Return {key: Jᵀx, (k, *shape)} of k pictures x (k, H, W, 3) for each view of `seeds`, from one rendering of the view."""
     count = len(pictures[0])
     sums = {key: np.zeros((count, *shape)) for key, shape in problem.shapes().items() if key in keys}
-    known = problem.renderer.parameters()
-    paths, launches = _BOUNDARY if any(known[key].rigid or known[key].welded for key in sums) else (0, 0)
     for (view, seed), parts in zip(seeds.items(), pictures, strict=True):
         rendering = session.image(parameters, view_request(problem, view, spp, seed.uint32()))
         shape = arrays.shape(rendering.images)
-        cost = (1.0 + (ADJOINT + paths) * count) * spp * math.prod(problem.sizes[view]), 1 + (1 + launches) * count
-        timing.add(*cost)
+        timing.add(*_cost(problem, keys, spp, view, count))
         for index, part in enumerate(parts):
             weights = problem.renderer.array(part.astype(np.float32).reshape(shape))
             gradient = session.adjoint(parameters, rendering.paths, weights)
             for name, total in sums.items():
                 total[index] += arrays.numpy(gradient[name]).reshape(total.shape[1:])
     return sums
+
+
+def seconds_of_probe(problem: Problem, spent: float, cost: float, pictures: int) -> float:
+    """Return the seconds of a probe of the curvature with this number of pictures for each view, where others of a `timing.cost` took
+    `spent` seconds."""
+    costs = (_cost(problem, problem.shapes(), adjoint_spp(problem), v, pictures) for v in range(len(problem.views)))
+    return 2.0 * sum(timing.cost(*of) for of in costs) * (1.0 if timing.counts() else spent / cost)
+
+
+def _cost(problem: Problem, keys: Collection[str], spp: int, view: int, pictures: int) -> tuple[float, int]:
+    """Return the paths and launches of a rendering of a view with the adjoints of this number of pictures."""
+    known = problem.renderer.parameters()
+    paths, launches = _BOUNDARY if any(known[key].rigid or known[key].welded for key in keys) else (0, 0)
+    count = (1.0 + (ADJOINT + paths) * pictures) * spp * math.prod(problem.sizes[view])
+    return count, 1 + (1 + launches) * pictures

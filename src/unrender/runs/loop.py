@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.backend import cache
 from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
 from unrender.core.random import WARM_UP, Key, check_seed
@@ -32,6 +34,7 @@ from unrender.runs.watches import remarks
 from unrender.scene.surfaces import guarded
 
 WARM_UP_STEPS = 2  # number of discarded steps before the first one
+_LONG_STEP = 0.2  # share of the budget in seconds from which the first of them is the only one
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0
 """Ratio of the pause before the next measurement of the parameters' error to the measurement's duration."""
@@ -107,11 +110,15 @@ def descend(run: Run) -> Result:
 
 
 def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
-    """Compile every kernel of a step by steps whose results are discarded. Return the elapsed seconds, and the snapshot after them."""
-    started = time.perf_counter()
+    """Compile every kernel of a step by steps whose results are discarded. Return the elapsed seconds, and the snapshot after them.
+
+    It is one step if that takes much of a budget in seconds without compiling, unless a resumed run compares its state with the snapshot.
+    """
+    started, kernels, whole = time.perf_counter(), cache.kernels_changed(), run
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
     state = run.state
     for _ in range(WARM_UP_STEPS):
+        began = time.perf_counter()
         estimate, state.estimator = run.estimator.estimate(
             run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
         )
@@ -123,6 +130,10 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         del update
         memory.evaluate_in_turn(state.optimizer)
         _gradient_noise(run, estimate)
+        whole.trial = time.perf_counter() - began, int(estimate.info.get("samples", 0))
+        is_long = run.deadline is not None and whole.trial[0] > _LONG_STEP * (run.seconds or math.inf)
+        if is_long and kernels == cache.kernels_changed() and "resumed" not in run.description:
+            break
     return time.perf_counter() - started, run.snapshot()
 
 

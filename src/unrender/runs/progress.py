@@ -31,14 +31,15 @@ class Progress(Callback):
 
     Args:
         console: console for the output; None for standard output.
+        began: time of `time.perf_counter` at which the command began; None for now.
 
     Attributes:
-        budget_began: time of `time.perf_counter` at which this object was created, or the latest run of several began.
+        budget_began: the same, or when the latest run of several began.
     """
 
-    def __init__(self, console: Console | None = None):
+    def __init__(self, console: Console | None = None, began: float | None = None):
         self._console = console or Console()
-        self.budget_began = self._began = time.perf_counter()
+        self.budget_began = self._began = time.perf_counter() if began is None else began
         self._stopwatch = phases.Stopwatch()
         self._listening: AbstractContextManager[None] | None = None
         self._within: list[str] = []
@@ -67,7 +68,7 @@ class Progress(Callback):
 
     @property
     def elapsed(self) -> float:
-        """Seconds since construction."""
+        """Seconds since the command began."""
         return time.perf_counter() - self._began
 
     # ------------------------------------------------------------------ phases

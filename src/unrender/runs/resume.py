@@ -143,7 +143,7 @@ def _description(run: Run, stored: StoredRun, fingerprint: dict[str, str]) -> di
     annotations = RunAnnotations(record.method, settings, record.choices, record.command, stored.method.final_spp)
     description = describe_run(run, annotations)
     description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
-    return description
+    return {**description, "resumed": record.resumed}
 
 
 @dataclass(frozen=True)

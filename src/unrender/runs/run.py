@@ -53,6 +53,9 @@ class Run:
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
             covers the steps only.
+        before: seconds of the budget before the first step.
+        grace: seconds after the deadline at which the end of the run may still be busy.
+        trial: seconds and samples of the last step of the warm-up.
         compiled: whether the warm-up has added kernels to the cache.
         tested: whether the budget has time for tests at the end, whose kernels the warm-up has then compiled.
     """
@@ -82,6 +85,9 @@ class Run:
     stopped: str = ""
     last_step: float | None = None
     deadline: float | None = None
+    before: float = 0.0
+    grace: float = math.inf
+    trial: tuple[float, int] = (0.0, 0)
     compiled: bool = False
     tested: bool = True
 

@@ -321,7 +321,13 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
 
 def command_line(context: typer.Context) -> str:
     """Return what the user typed, quoted for a shell."""
-    return shlex.join(context.find_root().obj or ["unrender"])
+    _, words = context.find_root().obj or (None, ["unrender"])
+    return shlex.join(words)
+
+
+def began(context: typer.Context) -> float | None:
+    """Return when the process began to start the command, on the clock of `time.perf_counter`; None if unknown."""
+    return (context.find_root().obj or (None, ()))[0]
 
 
 def finished_run(directory: Path) -> Path:

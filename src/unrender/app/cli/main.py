@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import metadata
@@ -18,6 +19,7 @@ from typing import Any
 from unrender.app.cli import memory
 from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, TERMINATED, WORDS, Signals
 from unrender.backend import limits, variant
+from unrender.core import timing
 from unrender.core.checks import encode_text
 from unrender.core.errors import UnknownOptionError, UnrenderError, VariantError
 from unrender.core.text import one_line
@@ -40,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             with signals:
-                command = _command(words)
+                command = _command(words, time.perf_counter() - (sum(timing.scheduled()) if is_process else 0.0))
                 value = command()
                 sys.stdout.flush()
             status = value if isinstance(value, int) else 0
@@ -66,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
-def _command(words: list[str]) -> Callable[[], Any]:
+def _command(words: list[str], began: float) -> Callable[[], Any]:
     if words == ["doctor"]:  # works even if other modules cannot be imported
         from unrender.app.cli.doctor import doctor
 
@@ -76,7 +78,7 @@ def _command(words: list[str]) -> Callable[[], Any]:
     variant.prepare()  # must run before Dr.Jit is imported
     from unrender.app.cli.app import app
 
-    return partial(app, words, prog_name="unrender", standalone_mode=False, obj=["unrender", *words])
+    return partial(app, words, prog_name="unrender", standalone_mode=False, obj=(began, ["unrender", *words]))
 
 
 def _status_of(error: BaseException, signals: Signals) -> int | None:

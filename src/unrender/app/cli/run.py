@@ -102,7 +102,7 @@ def run(
     from unrender.runs.progress import Progress
 
     console, command = Console(highlight=False), arguments.command_line(context)
-    with Progress(console) as progress:  # options are refused before the slow imports of "loading"
+    with Progress(console, arguments.began(context)) as progress:  # options are refused before slow imports
         chosen, processes = _method(method_name), arguments.workers(workers, insecure)
         if arguments.is_stages(problem):
             stages.refuse_settings(method_name, values, options, workers, no_cache)
@@ -228,11 +228,11 @@ def resume(
         stages.refuse_workers(workers)
         arguments.workers(None, insecure)
         command = arguments.command_line(context)
-        with Progress(console) as progress:
+        with Progress(console, arguments.began(context)) as progress:
             return stages.run_remaining(
                 stages.reopen(directory, (steps, seconds), variant, threads, command), console, progress
             )
-    with Progress(console) as progress:
+    with Progress(console, arguments.began(context)) as progress:
         with phases.phase("loading"):
             from unrender.app.cli.execute import introduce, resumed
             from unrender.runs import reopen

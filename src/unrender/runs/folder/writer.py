@@ -24,10 +24,10 @@ from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
-from unrender.runs.budget import cost_of_end, cost_of_numbers
+from unrender.runs.budget import can_test, cost_of_end, cost_of_numbers
 from unrender.runs.callbacks import Callback
-from unrender.runs.final_checks import with_misfit
-from unrender.runs.final_images import at_start, render_final_images, warm_up
+from unrender.runs.final_checks import at_start, with_misfit
+from unrender.runs.final_images import render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
 from unrender.runs.folder.history import THINNED_FROM, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
@@ -69,8 +69,6 @@ _FILES = (
 _STEPS, _MOST_SECONDS = 50, 60.0
 _SHARE = 1 / 100
 _CHECK_SECONDS = 1.0
-_TESTED_SHARE = (0.7, 0.3)
-"""Share of the budget that must be left after the warm-up for tests of what the images determine; less if kernels were compiled."""
 _EXPORT = "scene"
 
 _log = logging.getLogger("unrender")
@@ -160,8 +158,7 @@ class RunWriter(Callback):
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
         if self.final_spp != 1 and not run.stopped:
-            share = _TESTED_SHARE[run.compiled]
-            run.tested = run.seconds is None or run.time_left() > share * run.seconds
+            run.tested = can_test(run)
             with phases.phase(callbacks.COMPILING):
                 steps = run.steps or 0
                 counted = math.inf if run.seconds else cost_of_numbers(steps * warm["samples"] / WARM_UP_STEPS, steps)
@@ -191,7 +188,7 @@ class RunWriter(Callback):
             def left() -> float:
                 return run.time_left() if run.seconds is not None else allowed - timing.now()
 
-            given = self.final_spp, left, run.tested, result.pixel_weights, complete
+            given = self.final_spp, left, run.tested, result.pixel_weights, complete, run.grace
             with timing.counting(run.seconds is None):
                 images = render_final_images(run.problem, result, *given)
                 if images.rise:
