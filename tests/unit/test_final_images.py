@@ -218,6 +218,21 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     assert not late.standard_error  # what a run claims is checked first
 
 
+@pytest.mark.parametrize(("error", "fits", "open_"), [(0.01, True, False), (0.1, True, True), (0.01, False, True)])
+def test_a_factor_that_least_squares_know_is_not_open(error: float, fits: bool, open_: bool, monkeypatch: Any) -> None:
+    """Light between surfaces showed a lamp's radiance to 1.4 %, beside a line that it was known up to a factor only."""
+    made, values = problem(), {"wall": np.full(3, 0.4, np.float32)}
+    line = "wall and wall: determined up to a common factor only"
+    errors, zeros = {"wall": np.full(3, error)}, {"wall": np.zeros(3)}
+    check = least_squares.NumbersCheck({}, {}, errors, zeros, zeros)
+    for name, value in (("check_numbers", check), ("common_factor", [line])):
+        monkeypatch.setattr(final_images, name, lambda *_, value=value: value)
+    for name in ("_differs", "differs_still") if fits else ():
+        monkeypatch.setattr(final_images, name, lambda *_: None)
+    found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"))
+    assert (line in found.undetermined) is open_
+
+
 def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a wrong minimum, the references do not leave a number open by what least squares say."""
     made, values, errors = problem(), {"wall": np.full(3, 0.4, np.float32)}, {"wall": np.full(3, 1e-3)}

@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import timing
 from unrender.core.errors import InputError
-from unrender.core.text import listed
+from unrender.core.text import listed, names_in
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
 from unrender.runs.numbers import MOST_ELEMENTS, TOO_SHORT
 from unrender.runs.result import Result
@@ -27,6 +27,8 @@ _FACTOR = 1.25
 """Factor by which emitters become brighter and reflectances darker."""
 _LEAST_OF_FACTOR = 0.1
 """Fraction of the change by brighter emitters that must remain with darker reflectances, if the images distinguish the two."""
+_KNOWN = 0.1
+"""Standard error, relative to the largest value of a parameter, below which its factor is known."""
 _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _MOVED = 0.1
@@ -207,6 +209,14 @@ def common_factor(
         f"{_both(up, down)}: determined up to a common factor only{_after(problem, values, up, down)}"
         for up, down in shared
     ]
+
+
+def without_known(
+    lines: Sequence[str], values: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray]
+) -> list[str]:
+    """Return lines of `common_factor` without those of which all parameters have small standard errors {key: array}."""
+    known = {key for key, x in errors.items() if (x < _KNOWN * np.abs(values[key]).max()).all()}
+    return [line for line in lines if names_in(line, values) - known]
 
 
 def _is_shared(

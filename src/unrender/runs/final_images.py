@@ -20,6 +20,7 @@ from unrender.runs.determination import (
     untested_cells,
     untested_factor,
     with_lost,
+    without_known,
 )
 from unrender.runs.final_checks import (
     beyond_priors,
@@ -43,8 +44,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
 
-_PICTURE_PATHS = 1 << 22
-_FEWEST, _MOST = 16, 512
+_PICTURE_PATHS, _FEWEST, _MOST = 1 << 22, 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0
 """Time limit of final images relative to the time of the steps, and its minimum in seconds of an idle machine."""
 _SENSITIVITY_SHARE = 0.5
@@ -57,9 +57,8 @@ _LEAST_TESTS = 0.6
 _NUMBERS_SHARE, _NUMBERS_COUNTED = 0.05, 2.0
 """Time limit of least squares of few numbers relative to the time of the steps, and its minimum if renderings are counted: for four numbers
 and up to 90 x 90 pixels it takes 1.5. Otherwise the minimum is a second."""
-_TRIAL_PATHS = 1 << 18
-_PASS_PATHS, _MOST_PASS = 1 << 18, 16
-"""Paths of one pass over all views, and its most samples per pixel."""
+_TRIAL_PATHS, _PASS_PATHS, _MOST_PASS = 1 << 18, 1 << 18, 16
+"""Paths of a trial and of one pass over all views, and most samples per pixel of a pass."""
 _PICTURES_SHARE, _MOST_CHECK = 0.5, 1.25
 """Share of the time that is left at the end that final pictures may take with the check of unchanged pixels, and of what is left then that
 this check may take; its most time, relative to that of the pictures, that is set aside by rendering fewer samples."""
@@ -258,7 +257,7 @@ def _undetermined(
     seconds = min(max(_LOOK_SHARE * seconds_of_steps(result), _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
     per_pass, stated = _pass_spp(problem), result.standard_error
-    lines += common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
+    factors = common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
     of_numbers = allowed
@@ -268,6 +267,7 @@ def _undetermined(
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     limits = within(seconds), per_pass, within(most), sensitivities, deviations, path_seconds
+    lines += without_known(factors, result.parameters, deviations if fits else {})
     lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
