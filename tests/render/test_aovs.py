@@ -299,6 +299,29 @@ def test_an_unknown_that_no_view_shows_is_refused(key: str, views: list[ur.View]
     made(ur.View(np.zeros((SIZE, SIZE, 3)), sensor=len(second)))
 
 
+def test_noise_in_other_units_is_no_scale_of_a_prior() -> None:
+    """Depths in thousandths made a prior of the floor's paint 1e5 times as strong; exact ones halved it, and that of what both show stayed.
+
+    For the floor's height the scale is the mean of those of the views alone by their curvatures, here from differences of pictures.
+    """
+    height, near = MOVES.replace(".z", ".y"), {"near": "initial", "std": 0.1}
+    noise = np.abs(np.random.default_rng(0).normal(0, 0.03, (SIZE, SIZE, 3)))
+
+    def made(key: str, *of: ur.View) -> ur.Problem:
+        return ur.Problem(scene, [ur.Parameter(key, initial=None, prior=near)], of, max_depth=2)
+
+    still = made(height, ur.View(np.zeros((SIZE, SIZE, 3))), DEPTH)
+    pictures = [[ur.render(still, {height: y}, n, spp=256) for y in np.float32([-0.1, 0.0, 0.1])] for n in (0, 1)]
+    colour, exact = ur.View(pictures[0][1] + noise), replace(DEPTH, reference=pictures[1][1][..., :1])
+    coarse = replace(DEPTH, reference=1000 * (exact.reference + noise[..., :1]))
+    (alone,) = made(FLOOR, colour).prior_scales.values()
+    for depth in (exact, coarse):
+        assert made(FLOOR, colour, depth).prior_scales[FLOOR] == pytest.approx(alone, rel=1e-6)
+    both, own = made(height, colour, exact), [made(height, view).prior_scales[height] for view in (colour, exact)]
+    slopes = [np.mean(np.square(high - low)) for low, _, high in pictures]
+    assert both.prior_scales[height] == pytest.approx(np.average(own, weights=slopes), rel=0.5)
+
+
 def test_albedos_that_depend_on_normals_show_them() -> None:
     """A rough conductor's do; its normals were refused as an unknown."""
     metal = {"type": "cube", "bsdf": {"type": "roughconductor", "alpha": 0.3}}

@@ -14,6 +14,7 @@ import unrender as ur
 from unrender.core.errors import InputError
 from unrender.methods import method
 from unrender.scene.prior import Prior
+from unrender.scene.references import likelihood_scale
 
 pytestmark = pytest.mark.mitsuba
 
@@ -81,7 +82,7 @@ def test_gauss_newton_steps_of_a_lamp_lead_to_the_posterior_mean() -> None:
     assert "Gauss-Newton" in method("auto").plan(bare).lines[0]
     x = ur.optimize(bare, "auto", steps=40, progress=False).parameters[key]
     jacobian = np.stack([picture_at(x + e) - picture_at(x - e) for e in 0.05 * np.eye(3)], axis=-1).reshape(-1, 3) / 0.1
-    precision = jacobian.T @ jacobian / (bare.prior_scale * picture.size / 2)
+    precision = jacobian.T @ jacobian / (likelihood_scale(bare) * picture.size / 2)
     std = float(np.sqrt(3 / np.trace(precision)))
     result = ur.optimize(made({"near": expected.tolist(), "std": std}), "auto", steps=40, progress=False)
     mean = np.linalg.solve(precision + np.eye(3) / std**2, precision @ x + expected / std**2)

@@ -143,7 +143,7 @@ def test_priors_are_by_the_coordinates_of_the_descent(case: Case) -> None:
     assert total.losses is not None
     along = {"x": v.reshape(SIDE, SIDE, 1).astype(np.float32)}
     product = np.ravel(total.hvp(along)["x"]) - np.ravel(found.hvp(along)["x"])
-    scale = problem.prior_scale / 0.1**2
+    scale = problem.prior_scales["x"] / 0.1**2
     np.testing.assert_allclose(product, scale * case.S @ (case.S @ v), rtol=1e-3, atol=1e-3 * scale)
     points = np.stack([start, start + 0.1 * v])
     values = [0.5 * scale * np.sum((start + 0.1 * t * case.S @ v - 0.2) ** 2) for t in (0.0, 1.0)]

@@ -199,7 +199,7 @@ def test_a_descent_ends_at_the_posterior_mean() -> None:
     """(Mᵀ M / σ² + I / τ²)⁻¹ (Mᵀ y / σ² + m / τ²), which lies well between the prior's mean and the estimate without a prior."""
     prior = {"near": [0.1, 0.9, 0.4], "std": 0.05}
     problem, matrix, y = linear(prior)
-    variance = problem.prior_scale * len(y) / 2
+    variance = problem.prior_scales["x"] * len(y) / 2
     normal = matrix.T @ matrix / variance + np.eye(SIZE) / 0.05**2
     expected = np.linalg.solve(normal, matrix.T @ y / variance + np.array(prior["near"]) / 0.05**2)
     without = np.linalg.lstsq(matrix, y, rcond=None)[0]
@@ -237,7 +237,7 @@ def test_a_better_posterior_with_a_worse_picture_is_no_failure() -> None:
 def test_every_derivative_of_an_estimate_has_the_priors_part() -> None:
     problem, _, _ = linear({"near": 0.2, "std": 0.1})
     x = {"x": np.array([0.5, 0.1, 0.3], np.float32)}
-    s = problem.prior_scale
+    s = problem.prior_scales["x"]
     value, slope = s * np.sum((x["x"] - 0.2) ** 2) / (2 * 0.1**2), s * (x["x"] - 0.2) / 0.1**2
     zero = {"x": np.zeros(SIZE, np.float32)}
     block = BlockEstimate(("x",), Estimate(0.0, zero, (Hessian(np.zeros((SIZE, SIZE))),)))

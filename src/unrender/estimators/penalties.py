@@ -59,7 +59,8 @@ def _terms(problem: Problem, key: str, x: Array | np.ndarray) -> tuple[float, np
         value, gradient = value + own, gradient + slope
     if unknown.prior is not None:
         own, slope = unknown.prior.evaluate(values)
-        value, gradient = value + problem.prior_scale * own, gradient + problem.prior_scale * slope
+        scale = problem.prior_scales[key]
+        value, gradient = value + scale * own, gradient + scale * slope
     return value, gradient
 
 
@@ -102,14 +103,16 @@ def _product(
 ) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
     """Return a function from v to the product of the priors' Hessian with v, with respect to the parameters, or to the coordinates of a
     preconditioned estimate."""
-    unknowns, scale, coordinates = problem.unknowns, problem.prior_scale, problem.coordinates
+    unknowns, coordinates = problem.unknowns, problem.coordinates
     points = {key: arrays.numpy(x) for key, x in parameters.items()}
 
     def product(v: Mapping[str, Array | np.ndarray]) -> dict[str, np.ndarray]:
         products = {}
         for key, x in v.items():
             values, prior = x if isinstance(x, np.ndarray) else arrays.numpy(x), unknowns[key].prior
-            products[key] = np.zeros(points[key].shape) if prior is None else scale * prior.product(points[key], values)
+            products[key] = np.zeros(points[key].shape)
+            if prior is not None:
+                products[key] += problem.prior_scales[key] * prior.product(points[key], values)
         return products
 
     if not preconditioned:

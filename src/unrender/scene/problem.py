@@ -46,7 +46,7 @@ from unrender.scene.validation import (
     texture_coordinates,
 )
 from unrender.scene.view_checks import check_views, known_angles
-from unrender.scene.view_worlds import check_determined, is_storable, known_keys, of_views, requested_depth
+from unrender.scene.view_worlds import check_determined, is_storable, known_keys, of_views, requested_depth, unseen
 
 __all__ = ["Bounds", "Problem", "open_scene"]
 
@@ -252,9 +252,14 @@ class Problem(ViewLosses):
         )
 
     @cached_property
-    def prior_scale(self) -> float:
-        """The factor by which negative log densities of priors enter the loss, see `references.likelihood_scale`."""
-        return likelihood_scale(self)
+    def prior_scales(self) -> dict[str, float]:
+        """{key: factor by which the negative log density of its prior enters the loss}, see `references.likelihood_scale`."""
+        scales = {}
+        for key in [key for key, u in self.unknowns.items() if u.prior is not None]:
+            reasons = unseen(self.original_views, self.views, self.renderer, key)
+            showing = [index for index, of_view in enumerate(reasons) if not all(of_view)]
+            scales[key] = likelihood_scale(self, showing or None)
+        return scales
 
     @cached_property
     def learning_rates(self) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -184,30 +184,37 @@ def standard_deviation(reference: np.ndarray, mask: np.ndarray | None = None) ->
     return max(deviation, _LEAST * size, 1e-12)
 
 
-def likelihood_scale(problem: Problem) -> float:
-    """Return s, the factor by which negative log densities of priors enter the loss L.
+def likelihood_scale(problem: Problem, views: Iterable[int] | None = None) -> float:
+    """Return s, the factor by which the negative log density of an unknown's prior enters the loss L.
 
-    A loss of |image − reference|^p per pixel is s times a negative log likelihood with s = p L(noise) / N. L(noise) is the loss of
-    pictures that differ from the N values of the references by their noise alone. A grey picture has one value per pixel, else three. p is
-    measured: L grows by 2^p when that noise is doubled; 2 if it does not grow. Raises `InputError` if the loss is not finite there.
+    The loss of a view, |image − reference|^p per pixel, is s_v = p L_v(noise) / N_v times a negative log likelihood. L_v(noise) is its loss
+    if the picture differs from the N_v values of the reference by their noise alone. A grey picture has one value per pixel, else three. p
+    is measured: L_v grows by 2^p when that noise is doubled; 2 if it does not grow. s is the mean of s_v by the curvature of L_v, which is
+    p L_v(noise) / σ_v² times the square of a derivative. That derivative is taken as proportional to the reference's standard deviation,
+    so neither units nor a view without noise decide s. Raises `InputError` if the loss is not finite at the noise.
+
+    Args:
+        views: indices of the views that show the unknown; None for all.
     """
-    once, twice, count = 0.0, 0.0, 0.0
-    for index, view in enumerate(problem.views):
+    scales, curvatures = [], []
+    for index in range(len(problem.views)) if views is None else views:
+        view = problem.views[index]
         reference = np.asarray(view.reference, np.float32)
         mask = None if view.mask is None else np.asarray(view.mask)
         sigma = standard_deviation(reference, mask)
         noise = np.random.default_rng(index).standard_normal(reference.shape).astype(np.float32) * np.float32(sigma)
-        once += _loss(problem, index, reference + noise)
-        twice += _loss(problem, index, reference + 2 * noise)
+        once, twice = (_loss(problem, index, reference + factor * noise) for factor in (1, 2))
+        if not math.isfinite(once):
+            raise InputError(
+                f"prior: its scale is the loss at the references plus noise, where {type(problem.loss).__name__} is {once}; use a loss that "
+                "is finite there, or leave out the priors"
+            )
+        power = math.log2(twice / once) if 0 < once < twice < math.inf else 2.0
         values = reference.shape[-1] if np.ptp(reference, axis=-1).any() else 1  # grey pixels are one value each
-        count += values * (reference[..., 0].size if mask is None else float(mask.sum()))
-    power = math.log2(twice / once) if 0 < once < twice < math.inf else 2.0
-    if not math.isfinite(once):
-        raise InputError(
-            f"prior: its scale is the loss at the references plus noise, where {type(problem.loss).__name__} is {once}; use a loss that is "
-            "finite there, or leave out the priors"
-        )
-    return power * once / max(count, 1.0)
+        scales.append(power * once / max(values * (reference[..., 0].size if mask is None else float(mask.sum())), 1.0))
+        signal = np.nanvar(reference if mask is None else reference[mask > 0], dtype=np.float64)
+        curvatures.append(power * once * (1.0 + float(signal) / sigma**2))
+    return float(np.average(scales, weights=curvatures)) if any(curvatures) else float(np.mean(scales))
 
 
 def _loss(problem: Problem, view: int, image: np.ndarray) -> float:

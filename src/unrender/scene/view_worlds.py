@@ -109,21 +109,9 @@ def requested_depth(renderer: Renderer, views: Sequence[View], max_depth: int) -
 def check_determined(
     views: Sequence[View], located: Sequence[View], renderer: Renderer, unknowns: Sequence[str]
 ) -> None:
-    """Raise `FieldError` for an unknown on which no view depends.
-
-    Args:
-        views: Views as passed.
-        located: Views with the sensors of `renderer`, see `of_views`.
-        renderer: Renderer with all wrappers.
-        unknowns: Keys of the unknowns, in order.
-    """
-    states = worlds_of(renderer, [view.sensor for view in located])
+    """Raise `FieldError` for an unknown on which no view depends. Arguments as for `unseen`; `unknowns` are keys, in order."""
     for index, key in enumerate(unknowns):
-        members = scene_members(renderer, key)
-        if not all(member in scene_renderer(renderer).parameters() for member in members):
-            continue  # an unknown of photographs
-        pairs = list(zip(views, states, strict=True))
-        reasons = [[_unseen(member, view, state) for member in members] for view, state in pairs]
+        reasons = unseen(views, located, renderer, key)
         if not all(map(all, reasons)):
             continue
         if all(reason == _KNOWN for of_view in reasons for reason in of_view):
@@ -132,6 +120,22 @@ def check_determined(
         shown = dict.fromkeys(f"view {n} {of_view[0]}" for n, of_view in enumerate(reasons))
         what = f"no view depends on {key}: {listed(list(shown))}; add a view that does, or leave it out of the unknowns"
         raise FieldError(("parameters", index, "key"), what)
+
+
+def unseen(views: Sequence[View], located: Sequence[View], renderer: Renderer, key: str) -> list[list[str]]:
+    """Return, for each view and each parameter of the scene that an unknown sets, why the view does not depend on it; "" if it may.
+
+    Args:
+        views: Views as passed.
+        located: Views with the sensors of `renderer`, see `of_views`.
+        renderer: Renderer with all wrappers.
+        key: Key of the unknown. All views depend on one of photographs.
+    """
+    members = scene_members(renderer, key)
+    if not all(member in scene_renderer(renderer).parameters() for member in members):
+        return [[""] for _ in views]
+    states = worlds_of(renderer, [view.sensor for view in located])
+    return [[_unseen(member, *pair) for member in members] for pair in zip(views, states, strict=True)]
 
 
 _KNOWN = "knows it"
