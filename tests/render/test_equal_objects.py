@@ -63,6 +63,24 @@ def test_two_unknowns_share_the_notice() -> None:
     assert all(key in line for key in keys)
 
 
+def test_a_tie_of_all_that_mitsuba_merges_is_no_notice() -> None:
+    """It was said to be separate from its own members."""
+    keys = [f"{name}.bsdf.reflectance.value" for name in ("first", "second", "third")]
+    described = scene(matte(), matte(), third={"type": "disk", "bsdf": matte()})
+
+    def told(tied: Any) -> list[str]:
+        made = ur.Problem(described, [ur.Parameter("paint", keys=tied, initial=0.4)], [ur.View(np.zeros((4, 4, 3)))])
+        renamed = made.replaced(parameters=[ur.Parameter("clay", keys=tied, initial=0.4)])
+        assert renamed.notices == made.notices
+        return made.notices
+
+    assert told(keys) == []
+    (line,) = told(keys[:2])
+    assert line.startswith(f"{keys[0]}: first.bsdf equals third.bsdf, ")
+    (line,) = told(dict(zip(keys, (1.0, 0.5, 1.0), strict=True)))
+    assert line.startswith(f"{keys[0]}: first.bsdf equals second.bsdf and 1 more, ")
+
+
 def test_equal_textures_of_other_materials(tmp_path: Path) -> None:
     mi.Bitmap(np.ones((4, 4, 3), np.float32)).write(str(tmp_path / "a.exr"))
     described = scene(textured(0.2, tmp_path / "a.exr"), textured(0.3, tmp_path / "a.exr"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,9 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.rendering.tied import TiedRenderer
+from unrender.rendering.worlds import worlds_of
+from unrender.rendering.wrapper import layers
 from unrender.scene import coarse_to_fine
 from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project, truth_notice
 from unrender.scene.coarse_to_fine import CoarseToFine
@@ -45,6 +49,11 @@ class _Renderer(Renderer, Protocol): ...
 @runtime_checkable
 class _Noticing(Protocol):
     notices: Sequence[str]
+
+
+@runtime_checkable
+class _Merging(Protocol):
+    def merge_notices(self, tied: Sequence[AbstractSet[str]]) -> list[str]: ...
 
 
 def check_max_depth(max_depth: Any) -> None:
@@ -349,7 +358,12 @@ def _check_files(scene: Path) -> None:
 
 def renderer_notices(renderer: Renderer) -> Sequence[str]:
     """Return a renderer's deviations from its scene, one line each; a renderer need not report any."""
-    return renderer.notices if isinstance(renderer, _Noticing) else ()
+    lines = [*renderer.notices] if isinstance(renderer, _Noticing) else []
+    ties = [tie.factors for layer in layers(renderer) if isinstance(layer, TiedRenderer) for tie in layer.ties]
+    tied = [factors.keys() for factors in ties if len({*factors.values()}) == 1]
+    for world in worlds_of(renderer, range(len(renderer.resolutions()))):
+        lines += world.renderer.merge_notices(tied) if isinstance(world.renderer, _Merging) else []
+    return list(dict.fromkeys(lines))
 
 
 def axis_notices(unknowns: Mapping[str, Unknown], known: Mapping[str, ParameterInfo]) -> list[str]:

@@ -88,14 +88,13 @@ class MitsubaRenderer:
         replaced: Mapping[str, ReplacedMesh] | None = None,
         turns: Turns | None = None,
     ):
-        self.requested_depth, keys = max_depth, tuple(keys)
+        self.requested_depth, self._keys = max_depth, (keys := tuple(keys))
         self.pair = ScenePair(description, moving_targets(keys), replaced, turns)
         self.light_paths = LightPaths.of(self.pair.current, self.pair.volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
         scene, graph = self.pair.current, self.pair.loaded().graph
         self._surface_notices = (
             *graph.missing_attributes(),
-            *merge_notices(keys, self.pair.loaded().equal),
             *contact_notices(scene, keys),
             *jump_notices(scene, graph, keys),
             *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
@@ -225,6 +224,10 @@ class MitsubaRenderer:
             self._differential = copy.copy(self)
             self._differential._differential_bsdf, self._differential._sessions = True, {}
         return self._differential
+
+    def merge_notices(self, tied: Sequence[AbstractSet[str]]) -> list[str]:
+        """Return a line for each unknown whose object Mitsuba merges with equal ones; `tied` are parameters that have one value."""
+        return merge_notices(self._keys, self.pair.loaded().equal, tied)
 
     def with_aov(self, name: str) -> MitsubaRenderer:
         """Return a renderer of the same scenes with an AOV in place of radiance. Raises `InputError` with media and in spectral

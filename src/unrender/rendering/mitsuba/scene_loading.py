@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -298,8 +299,11 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[Equal, ...]:
     return tuple(tuple(sorted(equal)) for equal in groups.values())
 
 
-def merge_notices(keys: Iterable[str], equal: Sequence[Equal]) -> list[str]:
-    """Return one notice for each unknown whose object has `equal_objects`; parameters that equal one another share it."""
+def merge_notices(keys: Iterable[str], equal: Sequence[Equal], tied: Sequence[AbstractSet[str]]) -> list[str]:
+    """Return one notice for each unknown whose object has `equal_objects`; parameters that equal one another share it.
+
+    None if one of the sets `tied` of parameters that have one value contains all of them, since then one unknown changes them all here, too.
+    """
     notices: list[str] = []
     named: set[str] = set()
     for key in keys:
@@ -307,10 +311,10 @@ def merge_notices(keys: Iterable[str], equal: Sequence[Equal]) -> list[str]:
             (name, objects) for objects in equal for names in objects for name in names if key.startswith(f"{name}.")
         ]
         own, objects = max(holders, key=lambda holder: len(holder[0]), default=("", ()))
-        others = [names[0] for names in objects if own not in names]
+        rest, with_it = key.removeprefix(own), next((one for one in tied if key in one), {key})
+        others = [names[0] for names in objects if own not in names and with_it.isdisjoint(n + rest for n in names)]
         if not others or key in named:
             continue
-        rest = key.removeprefix(own)
         named.update(f"{name}{rest}" for names in objects for name in names)
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         notices.append(
