@@ -94,7 +94,9 @@ def priors(problem: ur.Problem, values: Mapping[str, Any]) -> Any:
     for key, unknown in problem.unknowns.items():
         if unknown.prior is not None:
             _, slope = unknown.prior.evaluate(np.array(dr.detach(values[key])))
-            total += dr.sum(values[key] * mi.TensorXf((problem.prior_scales[key] * slope).astype(np.float32)), axis=None)
+            total += dr.sum(
+                values[key] * mi.TensorXf((problem.prior_scales[key] * slope).astype(np.float32)), axis=None
+            )
     return total
 
 

@@ -445,6 +445,36 @@ def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
     assert ur.resume(tmp_path, made, steps=4).parameters["strength"] == pytest.approx(whole.parameters["strength"])
 
 
+@pytest.mark.usefixtures("short_ends")
+def test_a_run_with_functions_of_python_is_resumed_bit_for_bit_or_refused(tmp_path: Path) -> None:
+    """Another function of the same name was taken for the one of the run, and the descent went on with it."""
+
+    def made(factor: float = 0.5, power: float = 1.0) -> ur.Problem:
+        def lamp(values: Any) -> Any:
+            return factor * values["strength"] * mi.TensorXf([1.0, 0.8, 0.6])
+
+        def squares(image: Any, reference: Any) -> Any:
+            return dr.mean(dr.square(image - reference), axis=None) * power
+
+        unknown = ur.Parameter("strength", initial=1.0, bounds=(0.1, 10.0))
+        return problem(reference, {LEFT: LAMPS[LEFT], RIGHT: lamp}, unknown, loss=squares)
+
+    reference, parts = picture(strength=3.0), (ur.PathGradient(spp=4), ur.optimizers.Adam(0.1))
+    whole = ur.optimize(made(), *parts, steps=4)
+    ur.optimize(made(), *parts, steps=2, run_directory=tmp_path)
+    with pytest.raises(
+        InputError,
+        match=r"changed since: value of the expression of right\.intensity\.value near the start has changed;",
+    ):
+        ur.resume(tmp_path, made(factor=0.6), steps=4)
+    with pytest.raises(InputError, match=r"changed since: loss near the first reference was \S+, is \S+;"):
+        ur.resume(tmp_path, made(power=2.0), steps=4)
+    with pytest.raises(InputError, match="the problem was made in Python; pass it"):
+        ur.resume(tmp_path, steps=4)
+    result = ur.resume(tmp_path, made(), steps=4)
+    assert result.parameters["strength"].tobytes() == whole.parameters["strength"].tobytes()
+
+
 def test_an_unknown_number_sets_a_number_of_the_scene() -> None:
     """Its shape (1,) was refused for the shape () of a translation or a roughness."""
     key = "left.translation.x"

@@ -12,6 +12,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.io import scene_files
+from unrender.losses import FunctionLoss
 from unrender.rendering.expressions import expression_layer
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.worlds import WorldsRenderer
@@ -85,8 +86,20 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: weight"] = str(view.weight)
         parts[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
+    if isinstance(
+        problem.loss, FunctionLoss
+    ):  # functions of one name may differ; threads change the last digits of sums
+        reference = np.asarray(problem.views[0].reference, np.float32)
+        value = problem.loss_value(0, problem.renderer.array(0.9 * reference + 0.05))
+        parts["loss near the first reference"] = f"{arrays.number(value):.5g}"
     if (layer := expression_layer(problem.renderer)) is not None:
         parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
+        functions = [one.key for one in layer.expressions if one.text is None]
+        results = [
+            layer.scene_values({key: x * a for key, x in layer.unknowns.items()}) for a in (1.01, 1.0) if functions
+        ]
+        for key in functions:
+            parts[f"value of the expression of {key} near the start"] = digest(*(of[key].tobytes() for of in results))
     worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
     for index, view in enumerate(problem.original_views):
         if not view.own_world:

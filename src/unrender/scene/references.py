@@ -206,8 +206,8 @@ def likelihood_scale(problem: Problem, views: Iterable[int] | None = None) -> fl
         once, twice = (_loss(problem, index, reference + factor * noise) for factor in (1, 2))
         if not math.isfinite(once):
             raise InputError(
-                f"prior: its scale is the loss at the references plus noise, where {type(problem.loss).__name__} is {once}; use a loss that "
-                "is finite there, or leave out the priors"
+                f"prior: its scale is the loss at the references plus noise, where {type(problem.loss).__name__} is {once}; use a loss "
+                "that is finite there, or leave out the priors"
             )
         power = math.log2(twice / once) if 0 < once < twice < math.inf else 2.0
         values = reference.shape[-1] if np.ptp(reference, axis=-1).any() else 1  # grey pixels are one value each

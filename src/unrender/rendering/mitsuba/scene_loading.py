@@ -302,7 +302,7 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[Equal, ...]:
 def merge_notices(keys: Iterable[str], equal: Sequence[Equal], tied: Sequence[AbstractSet[str]]) -> list[str]:
     """Return one notice for each unknown whose object has `equal_objects`; parameters that equal one another share it.
 
-    None if one of the sets `tied` of parameters that have one value contains all of them, since then one unknown changes them all here, too.
+    None if one of the sets `tied` of parameters that have one value contains all of them: one unknown then changes them all here, too.
     """
     notices: list[str] = []
     named: set[str] = set()
