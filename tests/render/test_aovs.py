@@ -141,6 +141,40 @@ def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRend
 
 
 @pytest.mark.slow
+def test_the_gradient_of_a_mesh_by_colour_depth_and_mask_is_the_slope_of_the_loss() -> None:
+    """The ball grows and is shifted. A gradient without any of the three is found out."""
+    names, weights = (None, "depth", "mask"), (200.0, 0.3, 2.0)
+    path = mi.load_dict({"type": "path", "max_depth": 3})
+    colour = np.array(mi.render(mi.load_dict(scene(0.2)), integrator=path, spp=1024))
+    references = [colour, picture("depth", x=0.2), picture("mask", x=0.2)]
+    views = [ur.View(*of) for of in zip(references, (0,) * 3, weights, strict=True)]
+    views = [replace(view, aov=name) for view, name in zip(views, names, strict=True)]
+    made = problem(views, (BALL,), max_depth=3)
+    positions = made.initial_values()[BALL].reshape(-1, 3)
+    along, step, runs = positions + np.array([0.7, 0.2, 0.0], np.float32), 0.02, 8
+
+    def loss(at: np.ndarray, view: int, seed: int) -> float:
+        pictures = [ur.render(made, {BALL: at.ravel()}, view, spp=1 << 13, seed=2 * seed + half) for half in (0, 1)]
+        one, other = (np.asarray(one, float) - np.asarray(made.views[view].reference) for one in pictures)
+        return weights[view] * float(np.mean(one * other))
+
+    def slopes(view: int) -> np.ndarray:
+        ends = [[loss(positions + sign * step * along, view, seed) for seed in range(runs)] for sign in (1, -1)]
+        return np.subtract(*ends) / (2 * step)
+
+    by_view = [slopes(view) for view in range(3)]
+    estimates = [ur.estimate(made, ur.PathGradient(spp=2048), seed=seed).gradient[BALL] for seed in range(runs)]
+    found = np.array([np.sum(gradient.reshape(-1, 3) * along) for gradient in estimates])
+
+    def z(one: np.ndarray, other: np.ndarray) -> float:
+        return abs(one.mean() - other.mean()) / np.sqrt((one.var(ddof=1) + other.var(ddof=1)) / runs)
+
+    expected = sum(by_view)
+    assert z(found, expected) < 4.5
+    assert all(z(found, expected - of_view) > 4.5 for of_view in by_view)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("method", quick(["auto", "plain", "rcv", "coupled", "adaptive"], "auto"))
 def test_albedo_and_depth_share_one_descent(method: str) -> None:
     views = [ur.View(picture("albedo"), aov="albedo", weight=2.0), ur.View(picture("depth"), aov="depth")]
