@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
@@ -112,6 +113,59 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
     assert sweep_json()["best"] == 1
     assert unrender("sweep", "s").status == 0  # tried once more
     assert [trial["status"] for trial in sweep_json()["trials"]] == ["finished", "finished"]
+
+
+SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/><rfilter type="box"/></film></sensor>
+<shape type="rectangle" id="a"><bsdf type="diffuse"><rgb name="reflectance" value="0.2"/></bsdf></shape>
+<shape type="sphere" id="b"><bsdf type="diffuse"><rgb name="reflectance" value="0.3"/></bsdf></shape>
+<emitter type="point" id="lamp"><point name="position" x="0" y="0" z="2"/><rgb name="intensity" value="{}"/></emitter></scene>"""
+WORLDS = """scene = "one.xml"
+[[parameters]]
+key = "paint"
+initial = 0.25
+keys = {"a.bsdf.reflectance.value" = 1.0, "b.bsdf.reflectance.value" = 0.5}
+[[views]]
+reference = "photo.npy"
+with = {"lamp.intensity.value" = [4, 4, 4]}
+[[views]]
+reference = "photo.npy"
+scene = "two.xml"
+"""
+
+
+@pytest.mark.slow
+def test_views_of_different_worlds_and_ties(unrender, mitsuba_variant: str) -> None:
+    """Trials without a truth and with final pictures of one sample had failed, and were said to have gradients that are not finite."""
+    for name, intensity in (("one.xml", 2), ("two.xml", 5)):
+        Path(name).write_text(SCENE.format(intensity))
+    np.save("photo.npy", np.full((8, 8, 3), 0.1, np.float32))
+    Path("p.toml").write_text(WORLDS)
+    words = [
+        "p.toml",
+        "--method",
+        "plain",
+        "--steps",
+        8,
+        "--over",
+        "learning_rate=0.01,0.1",
+        "--variant",
+        mitsuba_variant,
+    ]
+    refused = unrender("sweep", *words, "--final-spp", 1, "--out", "refused")
+    line = "unrender: --final-spp: expected 2 or more, since trials without a truth are ranked by final pictures\n"
+    assert (refused.status, refused.error) == (2, line)
+    answer = unrender("sweep", *words, "--final-spp", 16, "--out", "s")
+    assert (answer.status, answer.error) == (0, "")
+    errors = [trial["error"] for trial in sweep_json()["trials"]]
+    assert sweep_json()["best"] == np.argmin(errors)
+    assert max(errors) > 1.1 * min(errors)
+    assert (
+        unrender("run", *words[:5], "-s", "learning_rate=0.1", "--out", "r", "--variant", mitsuba_variant).status == 0
+    )
+    alone, within = (Path(p, "history.jsonl").read_text().splitlines() for p in ("r", "s/trial-001-seed0"))
+    assert [json.loads(line)["loss"] for line in alone] == [json.loads(line)["loss"] for line in within]
 
 
 def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.MonkeyPatch) -> None:

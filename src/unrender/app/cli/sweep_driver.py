@@ -35,6 +35,7 @@ from unrender.app.sweeps.record import (
 )
 from unrender.app.sweeps.search import Search
 from unrender.backend.variant import check_threads
+from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
@@ -247,6 +248,10 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
                 check_threads(session.threads)
         running = arguments.use_variant(plan.variant, None if cluster else session.threads)
         problem = arguments.open_problem(plan.problem, plan.problem_settings, plan.cached)
+        if plan.final_spp == 1 and not problem.has_truth:
+            raise InputError(
+                "--final-spp: expected 2 or more, since trials without a truth are ranked by final pictures"
+            )
         job = Job(
             plan.problem,
             plan.problem_settings,

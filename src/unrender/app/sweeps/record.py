@@ -289,14 +289,16 @@ def trial_record(
     """Return the record of a trial from the outcomes of its runs; `message` is the error of the trial as a unit."""
     message = message or next((run.message for run in runs if run.message), "")
     errors = [run.error for run in runs if run.error is not None]
-    if message or not runs or len(errors) < len(runs) or any(run.status == "failed" for run in runs):
+    stopped = not runs or any(run.status == "failed" for run in runs)
+    unknown = "" if stopped or len(errors) == len(runs) else "no truth and no error of final pictures is known"
+    if message or stopped or unknown:
         return TrialRecord(
             number=number,
             settings=settings,
             status="failed",
             runs=list(runs),
             attempts=attempts,
-            message=message or "a run was stopped: its gradients were not finite",
+            message=message or unknown or "a run was stopped: its gradients were not finite",
         )
     spread = statistics.stdev(errors) / math.sqrt(len(errors)) if len(errors) > 1 else runs[0].standard_error
     return TrialRecord(
