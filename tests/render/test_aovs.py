@@ -160,7 +160,7 @@ def test_the_gradient_of_a_mesh_by_colour_depth_and_mask_is_the_slope_of_the_los
 
     def slopes(view: int) -> np.ndarray:
         ends = [[loss(positions + sign * step * along, view, seed) for seed in range(runs)] for sign in (1, -1)]
-        return np.subtract(*ends) / (2 * step)
+        return (np.array(ends[0]) - np.array(ends[1])) / (2 * step)
 
     by_view = [slopes(view) for view in range(3)]
     estimates = [ur.estimate(made, ur.PathGradient(spp=2048), seed=seed).gradient[BALL] for seed in range(runs)]
@@ -345,7 +345,9 @@ def test_noise_in_other_units_is_no_scale_of_a_prior() -> None:
         return ur.Problem(scene, [ur.Parameter(key, initial=None, prior=near)], of, max_depth=2)
 
     still = made(height, ur.View(np.zeros((SIZE, SIZE, 3))), DEPTH)
-    pictures = [[ur.render(still, {height: y}, n, spp=256) for y in np.float32([-0.1, 0.0, 0.1])] for n in (0, 1)]
+    pictures = [
+        [ur.render(still, {height: np.array(y, np.float32)}, n, spp=256) for y in (-0.1, 0.0, 0.1)] for n in (0, 1)
+    ]
     colour, exact = ur.View(pictures[0][1] + noise), replace(DEPTH, reference=pictures[1][1][..., :1])
     coarse = replace(DEPTH, reference=1000 * (exact.reference + noise[..., :1]))
     (alone,) = made(FLOOR, colour).prior_scales.values()
