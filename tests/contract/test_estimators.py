@@ -18,7 +18,9 @@ from tests.analytic import AnalyticRenderer
 from tiers import quick, slow
 from unrender.core import registry
 from unrender.core.random import Key
+from unrender.estimators.base import pixel_weights
 from unrender.estimators.capabilities import FreshGradient, NoiseSample
+from unrender.estimators.path_then_newton import PathThenNewtonState
 from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
 from unrender.optimizers import transforms
@@ -292,6 +294,24 @@ def test_the_shape_of_an_estimate(name: str) -> None:
     assert (found.hessian is not None) == ("hessian" in provides)
     assert found.hessian is None or found.hessian.shape == (size, size)
     assert (found.hvp is not None) == ("hvp" in provides)
+
+
+@pytest.mark.parametrize("limit", [None, 3.0])
+@pytest.mark.parametrize("kind", ["alone", "after paths", "beside paths"])
+def test_weights_of_pixels_have_the_shape_of_the_views(kind: str, limit: float | None) -> None:
+    """Those of Gauss-Newton steps with a noise limit, also as a part of another estimator; others have none."""
+    newton = ur.GaussNewton(spp=8, derivative_spp=4, noise_limit=limit)
+    kinds = {"alone": newton, "after paths": ur.estimators.PathThenNewton(newton=newton)}
+    made: Any = kinds.get(kind) or ur.HybridGradient(perturbed=newton, keys=("colour",))
+    asked, weights = problem(views=2), []
+    state = made.init(asked, asked.initial())
+    for step in range(3):
+        if isinstance(state, PathThenNewtonState):
+            state = replace(state, changed=True)
+        _, state = made.estimate(asked, asked.initial(), state, Key(0, step))
+        weights = pixel_weights(made, state)
+    assert [x.shape[:2] for x in weights] == list(asked.sizes) * (limit is not None)
+    assert all(((x > 0) & (x <= 1)).all() for x in weights)
 
 
 DRIFT = -0.06

@@ -12,11 +12,12 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
+from unrender.estimators.base import pixel_weights
 from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.estimators.hybrid import HybridState
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs import least_squares
-from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers, pixel_weights
+from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers
 from unrender.runs.numbers import Differences, Numbers
 
 SHAPE = (8, 8)
@@ -183,6 +184,14 @@ def test_a_block_beside_path_gradients_has_its_weights_in_the_test():
     np.testing.assert_allclose(weights.ravel(), 1.0 / (1.0 + np.array([1.0, 2.0, 9.0]) / 6.0))
     assert pixel_weights(ur.HybridGradient(perturbed=ur.GaussNewton()), state) == ()
     assert pixel_weights(ur.HybridGradient(), HybridState(None, None)) == ()  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_steps_after_path_gradients_have_weights_once_they_have_begun(changed: bool):
+    made = ur.estimators.PathThenNewton(newton=ur.GaussNewton(noise_limit=3.0))
+    state = made.init(problem(MATRIX), at(np.full(4, 0.5)))
+    state = dataclasses.replace(state, changed=changed, newton=GaussNewtonState({}, variances=(np.ones((2, 3, 1)),)))
+    assert [weights.shape for weights in pixel_weights(made, state)] == [(2, 3, 1)] * changed
 
 
 def test_the_slope_of_the_references_has_the_weights_of_the_pictures():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -126,3 +126,17 @@ class Estimator(Protocol):
     def estimate(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[Estimate, Any]:
         """Return an estimate at `parameters` and the next state. Pure: equal arguments give equal results."""
         ...
+
+
+@runtime_checkable
+class WeighsPixels(Protocol):
+    """An estimator whose steps weight pixels by the noise of earlier images."""
+
+    def pixel_weights(self, state: Any) -> tuple[np.ndarray, ...]:
+        """Return the weights of each view's pixels in the next step, (H, W, 1) or (H, W, 3), in (0, 1]; () if equal."""
+        ...
+
+
+def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
+    """Return the `WeighsPixels.pixel_weights` of an estimator; () for one without weights."""
+    return estimator.pixel_weights(state) if isinstance(estimator, WeighsPixels) else ()

@@ -31,6 +31,7 @@ from unrender.estimators.derivative_images import (
     cost,
     needs_derivatives,
     next_weight,
+    noise_weights,
     references_have_noise,
 )
 from unrender.estimators.gauss_newton_system import Point, System
@@ -163,6 +164,10 @@ class GaussNewton:
         scores = (ScoreCovariance,) if self.scores else ()
         images = (DerivativeImages,) if self.derivative_images else ()
         return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, *scores, *images)
+
+    def pixel_weights(self, state: GaussNewtonState) -> tuple[np.ndarray, ...]:
+        limit = self.noise_limit
+        return tuple(noise_weights(variance, limit) for variance in state.variances) if limit else ()
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,

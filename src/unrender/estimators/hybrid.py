@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from unrender.core import arrays, checks, trees
 from unrender.core.checks import Count, Index
 from unrender.core.errors import InputError
@@ -13,7 +15,7 @@ from unrender.core.random import WARM_UP, Key
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.base import Estimate, Estimator, pixel_weights
 from unrender.estimators.capabilities import (
     BlockEstimate,
     Capabilities,
@@ -184,6 +186,9 @@ class HybridGradient:
         if self._is_block:
             return Capabilities(Gradient, BlockEstimate)
         return Capabilities(Gradient, Variance) if Variance.name in self.path.provides else Capabilities(Gradient)
+
+    def pixel_weights(self, state: HybridState) -> tuple[np.ndarray, ...]:
+        return pixel_weights(self.perturbed, state.perturbed)
 
     def init(self, problem: Problem, parameters: Tree) -> HybridState:
         """Return the state before the first step. Raise `InputError` if one of the two estimators has no parameter, or refuses its own."""

@@ -98,6 +98,9 @@ class PathThenNewton:
         """A gradient, and a block after the change."""
         return Capabilities(Gradient, BlockEstimate)
 
+    def pixel_weights(self, state: PathThenNewtonState) -> tuple[np.ndarray, ...]:
+        return self.newton.pixel_weights(state.newton) if state.changed else ()
+
     def init(self, problem: Problem, parameters: Tree) -> PathThenNewtonState:
         """Return the state before the first step. Raises `InputError` for a parameter that one of the two does not support."""
         theta = trees.ravel(parameters)

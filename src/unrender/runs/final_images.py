@@ -130,7 +130,7 @@ def render_final_images(
             second if that is longer, and into about four million paths per image. That time excludes compiling.
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and the tests take half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
-        weights: weights of each view's pixels in the run's steps, see `least_squares.pixel_weights`.
+        weights: weights of each view's pixels in the run's steps, see `WeighsPixels`.
         complete: whether the standard errors of the result contain the references' noise.
         grace: further seconds within which the first probe of the sensitivity must end; without them nothing is tested.
     """

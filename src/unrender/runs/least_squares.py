@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -17,11 +16,6 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
-from unrender.estimators.base import Estimator
-from unrender.estimators.derivative_images import noise_weights
-from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
-from unrender.estimators.hybrid import HybridGradient, HybridState
-from unrender.estimators.path_then_newton import PathThenNewton, PathThenNewtonState
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
@@ -83,7 +77,7 @@ def check_numbers(
         start: {key: array} at the start.
         seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
-        weights: weights of each view's pixels in the run's steps (`pixel_weights`); () if equal. A fit with others has another solution.
+        weights: weights of each view's pixels in the run's steps (`Result`); () if equal. A fit with others has another solution.
         known: {key: standard errors} that the run states. Where they are small, noise of this check leaves no number undetermined.
     """
     numbers = Numbers.of(problem, values, start)
@@ -97,20 +91,6 @@ def check_numbers(
         return _of_tested_views(_check(numbers, sensitivities, timing.now() + seconds), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
         return NumbersCheck()
-
-
-def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
-    """Return the weights of each view's pixels in the next step, (H, W, 1) or (H, W, 3), from the noise of earlier images; () if equal.
-
-    Only `GaussNewton` with a `noise_limit` has weights, alone, for the numbers of a `HybridGradient`, or at the end of a `PathThenNewton`.
-    """
-    if isinstance(estimator, PathThenNewton) and isinstance(state, PathThenNewtonState) and state.changed:
-        estimator, state = estimator.newton, state.newton
-    if isinstance(estimator, HybridGradient) and isinstance(state, HybridState):
-        estimator, state = estimator.perturbed, state.perturbed
-    if not (isinstance(estimator, GaussNewton) and isinstance(state, GaussNewtonState) and estimator.noise_limit):
-        return ()
-    return tuple(noise_weights(variance, estimator.noise_limit) for variance in state.variances)
 
 
 def checked_keys(

@@ -17,10 +17,9 @@ import numpy as np
 from unrender.core import arrays, memory, trees
 from unrender.core.signals import GRACEFUL
 from unrender.core.trees import Tree
-from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.base import Estimate, Estimator, pixel_weights
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Choosing, Measuring, Optimizer
-from unrender.runs.least_squares import pixel_weights
 from unrender.runs.number_means import NumberTrace
 from unrender.runs.result import INTERRUPTED, TERMINATED, Result
 from unrender.scene.problem import Problem
