@@ -212,6 +212,16 @@ def test_what_changed_is_shown_and_can_be_forced(wall: Path, name: str) -> None:
     assert "resumed with force although changed since: " in result.warnings[0]
 
 
+def test_a_run_whose_unknowns_are_others_now_says_so(wall: Path) -> None:
+    """Its answer was about a learning rate of an unknown parameter."""
+    folder = wall.parent / "run"
+    parts = ur.PathGradient(spp=2), ur.optimizers.Adam({WALL: 0.05, "*": 0.05})
+    ur.optimize(ur.Problem.from_file(wall), *parts, 2, run_directory=folder)
+    _edit(wall, f'{WALL}"\ninitial = [0.5, 0.4, 0.3]', 'sky.radiance.value"\ninitial = 0.5')
+    with pytest.raises(InputError, match=rf"changed since: parameter {WALL}.* is gone; .*; start a new run"):
+        ur.resume(folder, steps=4)
+
+
 def test_other_versions_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     interrupted(ur.gallery.problem("exponential"), folder)

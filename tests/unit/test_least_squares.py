@@ -19,6 +19,7 @@ from unrender.rendering.renderer import SampleRequest
 from unrender.runs import least_squares
 from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers
 from unrender.runs.numbers import Differences, Numbers
+from unrender.runs.reference_distortions import distortions
 
 SHAPE = (8, 8)
 ROWS = SHAPE[0] * SHAPE[1] * 3
@@ -476,7 +477,12 @@ def test_numbers_have_no_standard_errors_where_a_distortion_of_the_reference_wou
 
 @pytest.mark.parametrize(
     ("brightness", "turned", "words"),
-    [(1.0, False, ""), (0.97, False, ""), (0.7, False, "were 0.7 times as bright"), (1.0, True, "do not explain")],
+    [
+        (1.0, False, ""),
+        (0.97, False, ""),
+        (0.7, False, "were 0.7 times as bright"),
+        (1.0, True, "do not explain"),
+    ],
 )
 def test_a_distortion_that_explains_little_of_the_difference_has_no_name(brightness: float, turned: bool, words: str):
     """A mirrored reference looked blurred, and so did one that was darker by half a stop."""
@@ -492,6 +498,8 @@ def test_a_distortion_that_explains_little_of_the_difference_has_no_name(brightn
     found = check_numbers(made, {"a": end.astype(np.float32)}, made.initial_values(), FAR).distorted
     assert words in found
     assert bool(found) == bool(words)
+    brightness_is = next(iter(distortions(scenery, reference)))
+    assert [brightness_is(np.array([by])) for by in (-254.0, 1.02)] == [f"were {x} times as bright" for x in (255, 0)]
 
 
 def test_no_time_no_check():

@@ -16,6 +16,8 @@ from unrender.runs.run import Run
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.problem import Problem
 
+PARTS = "estimator", "optimizer"
+"""Parts of a run that decide its steps beside the problem."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
@@ -88,5 +90,4 @@ def recorded_measures(problem: Problem) -> dict[str, Any]:
 
 def fingerprint_of(run: Run) -> dict[str, str]:
     """Return the fingerprints of the problem, the estimator and the optimizer, without memory addresses."""
-    components = {"estimator": run.estimator, "optimizer": run.optimizer}
-    return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(part)) for name, part in components.items()}
+    return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(getattr(run, name))) for name in PARTS}

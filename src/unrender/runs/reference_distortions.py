@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unrender.display import formatting
 from unrender.statistics import scores
 from unrender.statistics.paired_losses import slices_of_images
 
@@ -39,7 +40,7 @@ def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.n
     equal = reference >= (1.0 - _EQUAL) * white
     saturated = (equal & (np.count_nonzero(equal) >= _PLATEAU)) * (np.minimum(image, white) - image)
     return {
-        lambda by: f"were {1.0 - by[0]:.2g} times as bright": [image],
+        lambda by: f"were {formatting.number(max(round(1.0 - by[0], 2), 0.0))} times as bright": [image],
         lambda by: f"were shifted by {-by[0]:.2g} pixels along x and {-by[1]:.2g} along y": [-along, -down],
         lambda by: "were blurred" if by[0] < 0.0 else "were sharper": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
         lambda by: f"were saturated at {white:.3g} (set the loss Censored)": [saturated],

@@ -29,13 +29,13 @@ from unrender.runs.folder.schema import ENDED, HISTORY, METHOD, RunRecord
 from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.loop import descend, initialize, prepare
-from unrender.runs.metadata import RunAnnotations, describe_run, fingerprint_of, first_values
+from unrender.runs.metadata import PARTS, RunAnnotations, describe_run, fingerprint_of, first_values
 from unrender.runs.number_means import NumberTrace
 from unrender.runs.optimize import check, connected, open_writer
 from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, raise_termination
 from unrender.scene.coarse_to_fine import NEVER
-from unrender.scene.fingerprint import differences, shortened
+from unrender.scene.fingerprint import differences, fingerprint, shortened
 from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
@@ -101,12 +101,10 @@ def resume_run(
 ) -> Result:
     """Resume the run. See `unrender.resume`; `earlier` contains the seconds of earlier phases; `began`: see `RunAnnotations`."""
     folder, method = stored.folder, stored.method
-    plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
-    check(plan.estimator, plan.optimizer, method.steps, method.seconds)
-    run = prepare(plan, method.steps, method.seconds, method.seed)
+    run = _prepared(stored, problem, estimator, optimizer)
     run.folder = folder
     run.begin_budget(began)
-    run.initial, fingerprint = first_values(run), fingerprint_of(run)
+    run.initial, found = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
             changes = _changes(run, stored, source.checkpoint)
@@ -119,7 +117,7 @@ def resume_run(
                 run.ahead = _ahead(source.checkpoint)
                 initialize(run, max(source.checkpoint.manifest.step - 1 + run.ahead, 0))
             restoring = _Restore(stored.record, source, changes, writer)
-            run.description, run.history, run.warmup_seconds = _description(run, stored, fingerprint), [], 0.0
+            run.description, run.history, run.warmup_seconds = _description(run, stored, found), [], 0.0
             try:
                 with connected(run, callbacks, (restoring, writer), earlier):
                     result = descend(run)
@@ -130,6 +128,23 @@ def resume_run(
             raise InputError(f"run folder {folder}: no checkpoint can be used")
     raise_termination(run)
     return result
+
+
+def _prepared(stored: StoredRun, problem: Problem, estimator: Estimator | None, optimizer: Optimizer | None) -> Run:
+    """Return the run before its first step. If its method does not suit the problem, an `InputError` says what has changed."""
+    method, table = stored.method, stored.method.model_dump()
+    try:
+        plan = Plan.from_table(problem, table, str(stored.folder / METHOD), estimator, optimizer)
+        check(plan.estimator, plan.optimizer, method.steps, method.seconds)
+        return prepare(plan, method.steps, method.seconds, method.seed)
+    except InputError as error:
+        before, now = stored.record.problem.fingerprint or {}, fingerprint(problem)
+        if not (changes := differences({part: x for part, x in before.items() if part not in PARTS}, now)):
+            raise
+        told = f"run folder {stored.folder}: changed since: {shortened(changes)}"
+        raise InputError(
+            f"{told}; its method does not suit these changes; start a new run, by `unrender run`"
+        ) from error
 
 
 class _UnusableCheckpoint(InputError):
