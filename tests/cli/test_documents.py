@@ -96,7 +96,7 @@ SLOW_EXAMPLES = {
     "unrender.estimators.smoothing.grey_box",
 }
 ILLUSTRATIONS = {
-    "unrender.optimizers.chain.Chain": "the names are not imported; the page of optimizers runs such one",
+    "unrender.optimizers.recipes.Chain": "the names are not imported; the page of optimizers runs such one",
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
     "unrender.app.distributed.distribute.distribute": "it starts worker processes, as tests/render/test_dealt_runs.py does",

@@ -14,8 +14,7 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from tiers import quick
 from unrender.core.errors import InputError
-from unrender.methods import effects
-from unrender.methods.base import Method, Options, method, methods
+from unrender.methods.base import Method, Options, choices, method, methods
 from unrender.methods.plan import Plan
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import ParameterInfo
@@ -75,7 +74,7 @@ def problem(of: type[AnalyticRenderer] = Spaces, loss: Any = None) -> ur.Problem
 
 def others(options: type[Options], name: str, default: Any) -> list[Any]:
     """Other valid values of an option."""
-    return effects.choices(options(), name) or [OTHER[name] if name in OTHER else type(default)(default / 2)]
+    return choices(options(), name) or [OTHER[name] if name in OTHER else type(default)(default / 2)]
 
 
 def contexts(one: Method, option: str) -> Iterator[dict[str, Any]]:
@@ -85,7 +84,7 @@ def contexts(one: Method, option: str) -> Iterator[dict[str, Any]]:
         small["pixels"] = 0
     yield small
     for name in one.options.model_fields.keys() - {option}:
-        for value in effects.choices(one.options(), name):
+        for value in choices(one.options(), name):
             if value is not None:
                 yield small | {name: value}
 

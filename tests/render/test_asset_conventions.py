@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.app.exporting import formats, gltf, textures
+from unrender.app.exporting import formats, textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.app.exporting.materials import Material
 from unrender.display.pictures import png
@@ -46,7 +46,7 @@ def test_gltf_as_trimesh_reads_it() -> None:
     pytest.importorskip("pygltflib")
     given = quad()
     found = trimesh.load(
-        io.BytesIO(gltf.glb(asset(given, replace(given, name="other")))), file_type="glb", process=False
+        io.BytesIO(formats.glb(asset(given, replace(given, name="other")))), file_type="glb", process=False
     )
     assert list(found.geometry) == ["quad", "other"]
     mesh = found.geometry["quad"]
@@ -104,7 +104,7 @@ def test_charts_of_both_kinds_are_told_apart() -> None:
 def test_blender_looks_the_light_up_where_mitsuba_does() -> None:
     """Both programs' formulas of the picture's coordinates, for a light that is turned."""
     turned = np.array(mi.ScalarTransform4f().rotate([0.48, 0.8, 0.36], 70).matrix, float)[:3, :3]
-    found = gltf.blender_settings(asset(quad(), environment=np.ones((2, 4, 3)), environment_to_world=turned))
+    found = formats.blender_settings(asset(quad(), environment=np.ones((2, 4, 3)), environment_to_world=turned))
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     x, y, z = np.linalg.inv(turned) @ directions.T
@@ -121,7 +121,7 @@ def test_blenders_cameras_see_what_mitsubas_do() -> None:
     sensor = mi.load_dict({"type": "perspective", "fov": 38, "fov_axis": "x", "to_world": pose, "film": film,
                            "principal_point_offset_x": offset[0], "principal_point_offset_y": offset[1]})  # fmt: skip
     camera = Camera("c", np.array(pose.matrix, float), 38.0, offset, size, (0.1, 10.0))
-    (found,) = gltf.blender_settings(asset(quad(), cameras=(camera,)))["cameras"]
+    (found,) = formats.blender_settings(asset(quad(), cameras=(camera,)))["cameras"]
     places = np.random.default_rng(1).uniform(size=(20, 2))
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(*places.T.astype(np.float32)), mi.Point2f(0.5))
     # Blender: a sensor as wide as 1, shifted in widths; right, up, backwards.
@@ -139,9 +139,9 @@ def test_diffuse_materials_do_not_shine() -> None:
     pytest.importorskip("pygltflib")
     part = quad()
     dull = replace(part, material=replace(part.material, ior=1.0))
-    assert b'"KHR_materials_specular": {"specularFactor": 0.0}' in gltf.glb(asset(dull)).replace(b'":', b'": ').replace(
-        b":  ", b": "
-    )
+    assert b'"KHR_materials_specular": {"specularFactor": 0.0}' in formats.glb(asset(dull)).replace(
+        b'":', b'": '
+    ).replace(b":  ", b": ")
 
 
 def test_maps_of_different_sizes_are_packed() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 import made_asset
 from unrender.app.exporting import asset as assets
-from unrender.app.exporting import gltf, textures
+from unrender.app.exporting import formats, textures
 from unrender.app.exporting.asset import Asset
 from unrender.app.exporting.scene_folder import export
 from unrender.losses import metrics
@@ -127,7 +127,7 @@ def _altered(asset: Asset, **changes: Callable[[Any], Any]) -> bytes:
     """The .glb of an asset, with changes of its part."""
     (part,) = asset.parts
     changed = dataclasses.replace(part, **{name: change(getattr(part, name)) for name, change in changes.items()})
-    return gltf.glb(dataclasses.replace(asset, parts=(changed,)))
+    return formats.glb(dataclasses.replace(asset, parts=(changed,)))
 
 
 FAULTS = {
@@ -158,7 +158,7 @@ def test_normals_of_mirrored_charts_are_turned(
     exported: Path, picture: np.ndarray, noise: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(textures, "mirrored_texels", lambda part, height, width: np.zeros((height, width), bool))
-    found = metrics.psnr(_rendered(gltf.glb(assets.read(exported / "scene.xml")), exported), picture)
+    found = metrics.psnr(_rendered(formats.glb(assets.read(exported / "scene.xml")), exported), picture)
     print("PSNR charts", found)
     assert found < noise - FAINTEST
 

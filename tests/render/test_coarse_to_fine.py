@@ -31,7 +31,7 @@ from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.optimizers.chain import ChainState
+from unrender.optimizers.recipes import ChainState
 from unrender.runs import loop, refinement
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.upsampling import SQUARES

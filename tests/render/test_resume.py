@@ -18,7 +18,7 @@ import unrender as ur
 from tiers import quick
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.optimizers.chain import ChainState
+from unrender.optimizers.recipes import ChainState
 from unrender.optimizers.transforms.averages import MeanDirection
 from unrender.optimizers.transforms.scale import MeanSquare
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack

@@ -26,10 +26,10 @@ from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import newton, sampling
+from unrender.methods.rules import newton, paths
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.paths import first_rates
-from unrender.methods.rules.traits import Traits
+from unrender.methods.rules.traits import Traits, choose_image, renders_half
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.optimize import optimize
@@ -156,9 +156,9 @@ def test_the_problem_is_kept_as_it_was_given() -> None:
 
 
 def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    for paths, spp in ((1, 2), (16, 2), (63, 2), (64, 4), (200, 8), (1 << 15, 16)):
-        constants(monkeypatch, paths=paths)
-        assert chosen(problem())[0].spp == spp, paths
+    for number, spp in ((1, 2), (16, 2), (63, 2), (64, 4), (200, 8), (1 << 15, 16)):
+        constants(monkeypatch, paths=number)
+        assert chosen(problem())[0].spp == spp, number
     assert chosen(problem(), spp=5)[0].spp == 5
     assert chosen(problem())[1].wiener
 
@@ -335,7 +335,7 @@ def test_textures_of_one_material_share_the_rate() -> None:
 def test_mini_batches_of_views_are_damped_as_whole_views_are(loss: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of pixels here and there are not: their noise is not known."""
     for sampler, damped in ((pixels.All(), True), (pixels.Views(1), True), (pixels.Uniform(4), False)):
-        monkeypatch.setattr(sampling, "sampler", lambda traits, sampler=sampler: (sampler, ""))
+        monkeypatch.setattr(paths, "choose_sampler", lambda traits, sampler=sampler: (sampler, ""))
         expected = CONSTANTS.tolerance if damped and not loss.linear else 0.0
         assert chosen(problem(loss))[0].tolerance == expected
 
@@ -347,9 +347,7 @@ def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
         made = problem(loss)
         unknowns = {**made.unknowns, "map": dataclasses.replace(made.unknowns["map"], faces=np.zeros((0, 3)))}
         moving = made.with_parts(unknowns=unknowns)
-        return type(
-            sampling.image(Traits(moving, module.AutoMethod.model_validate({}), CONSTANTS), sampler)[0]
-        ).__name__
+        return type(choose_image(Traits(moving, module.AutoMethod.model_validate({}), CONSTANTS), sampler)[0]).__name__
 
     for loss, name in (
         (losses.L1(), "RecursiveControlVariate"),
@@ -360,7 +358,7 @@ def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
     assert image(losses.L1(), pixels.Uniform(4)) == "Plain"
     many: Any = SimpleNamespace(views=[None] * 16)
     samplers = (pixels.All(), pixels.Views(8), pixels.Views(7), pixels.Uniform(4))
-    assert [sampling.renders_half(many, sampler) for sampler in samplers] == [True, True, False, False]
+    assert [renders_half(many, sampler) for sampler in samplers] == [True, True, False, False]
 
 
 def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unrender.app.capture import photometric_folder, turntable
+from unrender.app.capture import photometric_folder, silhouettes
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import CapturedView, StoredViews
 from unrender.app.capture.formats import is_lit, lights
@@ -50,8 +50,8 @@ def _views(still: bool) -> list[CapturedView]:
 
 def test_the_axis_and_the_turns_of_a_turntable() -> None:
     poses = _poses()
-    np.testing.assert_allclose(turntable.axis(poses), _WORLD[:3, 1], atol=1e-12)
-    turns = turntable.light_turns(poses)
+    np.testing.assert_allclose(silhouettes.axis(poses), _WORLD[:3, 1], atol=1e-12)
+    turns = silhouettes.light_turns(poses)
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
     # As the cameras see it, the light stands still.
     seen = poses[:, :3, :3].transpose(0, 2, 1) @ turns
@@ -60,11 +60,11 @@ def test_the_axis_and_the_turns_of_a_turntable() -> None:
 
 
 def test_a_background_that_stands_still_tells_of_a_turntable() -> None:
-    assert turntable.likeness(_views(still=True)) > 0.99
-    assert turntable.stands_still(_views(still=True))
-    assert abs(turntable.likeness(_views(still=False))) < 0.25
-    assert not turntable.stands_still(_views(still=False))
-    assert turntable.likeness(_views(still=True)[:3]) == 0
+    assert silhouettes.likeness(_views(still=True)) > 0.99
+    assert silhouettes.stands_still(_views(still=True))
+    assert abs(silhouettes.likeness(_views(still=False))) < 0.25
+    assert not silhouettes.stands_still(_views(still=False))
+    assert silhouettes.likeness(_views(still=True)[:3]) == 0
 
 
 def test_views_are_read_from_their_file_as_they_were() -> None:

@@ -63,7 +63,6 @@ def solve(
 
 
 def _alpha_at_radius(step: np.ndarray, v: np.ndarray, radius: float) -> float:
-    """Return the α >= 0 at which step + α v lies on the sphere of this radius."""
     a, b = float(v @ v), float(step @ v)
     c = float(step @ step) - radius**2
     return (-b + math.sqrt(max(b * b - a * c, 0.0))) / a

@@ -205,7 +205,6 @@ class PreconditionedPerturbations:
             )
 
     def __bool__(self) -> bool:
-        """Return whether there is a preconditioner."""
         return bool(self._maps)
 
     def deviations(self, sigma: Mapping[str, float]) -> dict[str, float]:

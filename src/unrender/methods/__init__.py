@@ -1,6 +1,6 @@
 """Methods by name: a matching estimator and optimizer, with user options.
 
-Each file registers one method: a class of documented options whose `build` returns both parts.
+A method is a class of documented options whose `build` returns both parts.
 """
 
 from unrender.methods.base import Method, Options, method, methods

@@ -3,13 +3,10 @@
 from unrender import schedules
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.chain import Chain
 from unrender.optimizers.cma_es import CMAES
-from unrender.optimizers.lbfgs import LBFGS
-from unrender.optimizers.newton import Newton, NewtonCG
-from unrender.optimizers.partitioned import Partitioned
-from unrender.optimizers.recipes import SGD, Adam, MetaAdam, ScheduleFree
-from unrender.optimizers.successive import Successive
+from unrender.optimizers.newton import LBFGS, Newton, NewtonCG
+from unrender.optimizers.partitioned import Partitioned, Successive
+from unrender.optimizers.recipes import SGD, Adam, Chain, MetaAdam, ScheduleFree
 
 __all__ = [
     "CMAES",

@@ -166,11 +166,9 @@ class _Search:
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean of the distribution, (n,)."""
         return np.array(self._strategy.mean)
 
     def differs(self, here: np.ndarray) -> bool:
-        """Return whether `here` (n,) differs from the mean."""
         return bool(np.any(np.abs(here - self._strategy.mean) > self._tolerance()))
 
     def bound_at(self, here: np.ndarray) -> None:

@@ -17,8 +17,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import AtBounds, Smoothing
 from unrender.optimizers.base import check_rates, rates_of, schedule_factor
-from unrender.optimizers.chain import ChainState
-from unrender.optimizers.recipes import Adam
+from unrender.optimizers.recipes import Adam, ChainState
 from unrender.scene.upsampling import NotCarried, Upsampler
 from unrender.schedules import Schedule
 
@@ -133,5 +132,4 @@ def apply_direction(
 
 
 def _on_host(parameters: Tree) -> Tree:
-    """Return zeros of the parameters' shapes, in double precision."""
     return {key: np.zeros(arrays.shape(x)) for key, x in parameters.items()}

@@ -59,7 +59,6 @@ def pool(tiles: Tiles, means: np.ndarray, counts: np.ndarray, prior: float = 64.
 
 
 def _halved(x: np.ndarray) -> np.ndarray:
-    """Return the sums over blocks of 2 × 2."""
     rows, columns = np.arange(0, x.shape[0], 2), np.arange(0, x.shape[1], 2)
     return np.add.reduceat(np.add.reduceat(x, rows, axis=0), columns, axis=1)
 

@@ -80,7 +80,6 @@ class Views(checks.Checked, PixelSampler):
 
 
 def _all_pixels(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> MiniBatch:
-    """Return all pixels of the chosen views, with the views' weights."""
     known = problem.sizes
     sizes = [math.prod(known[view]) for view in chosen]
     like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))

@@ -316,7 +316,6 @@ def _interpolated(y: Array, coarse: tuple[int, ...], fine: tuple[int, ...], chan
 
 
 def _rows(x: Array, cells: np.ndarray, channels: int) -> Array:
-    """Return the channels of these cells, flat."""
     index = (cells[:, None] * channels + np.arange(channels)).reshape(-1)
     return arrays.gather(x, arrays.like_integers(index, x))
 

@@ -187,6 +187,5 @@ def _edges(corners: np.ndarray) -> np.ndarray:
 
 
 def _pairs(edges: np.ndarray) -> np.ndarray:
-    """Return each edge with different ends once."""
     pairs = np.sort(edges, axis=1)
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)

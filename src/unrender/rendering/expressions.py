@@ -249,7 +249,6 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
 def _evaluated(
     expressions: Iterable[Expression], keys: Collection[str], reads: _Reads, known: Mapping[str, ParameterInfo]
 ) -> Tree:
-    """Return the values of the expressions of these keys."""
     return {one.key: _shaped(one, reads, known[one.key].shape) for one in expressions if one.key in keys}
 
 

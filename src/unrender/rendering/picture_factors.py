@@ -126,11 +126,9 @@ class PictureSession(SessionWrapper, Generic[_Renderer]):
         return inner.emitter_moments(scene, paths.inner, self._state(tangents), weights * slopes, noise * slopes)
 
     def _places(self, request: SampleRequest) -> Any:
-        """Return `PicturePaths.places` of a request."""
         del request
 
     def _outer_images(self, parameters: Tree, places: Any, images: Array) -> Array:
-        """Apply the parameter to images."""
         raise NotImplementedError
 
     def _slopes(self, parameters: Tree, places: Any, images: Array, weights: Array) -> Array:

@@ -136,7 +136,6 @@ def affordable(problem: Problem, spp: int, seconds: float, least: int, path_seco
 
 
 def _moved(initial: np.ndarray, values: np.ndarray) -> bool:
-    """Return whether values are far from the initial ones relative to their size."""
     return bool(np.linalg.norm(values - initial) > _MOVED * np.linalg.norm(values))
 
 
@@ -289,7 +288,8 @@ def change_of_images(
         differences, own = [], problem.test_weights(view)
         for seed in _SEEDS:
             first, second = (render(problem, state, view, spp, seed, per_pass) for state in (before, after))
-            first, second = (np.where(own[..., None] > 0, x, 0.0).astype(np.float64) for x in (first, second))
+            seen = np.where(own[..., None] > 0, problem.units[view], 0.0)
+            first, second = (np.where(seen > 0, x * seen, 0.0).astype(np.float64) for x in (first, second))
             differences.append(second - first)
             squares.append(np.sum(own * np.mean(np.square(first), axis=-1)) / len(_SEEDS))
         products.append((own * np.mean(differences[0] * differences[1], axis=-1)).reshape(-1))

@@ -157,8 +157,8 @@ def render_final_images(
         if not tested and result.steps and not differs:
             lines, deviations = _left_out(problem, result)
         if everything:
-            given = problem, result, known, left, tests, spent / paths, weights
-            lines, warnings, deviations, unseen = _undetermined(*given, fits=fits, complete=complete)
+            end = _Tests(problem, result, weights, left, tests, spent / paths)
+            lines, warnings, deviations, unseen = _undetermined(end, known, fits, complete)
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
             if halves and left() > 0.0:
@@ -226,34 +226,37 @@ def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.nda
     return maps
 
 
+@dataclass(frozen=True)
+class _Tests:
+    """Run whose end is tested, `weights` and `left` of `render_final_images`, seconds for all tests, and time of a path."""
+
+    problem: Problem
+    result: Result
+    weights: Sequence[np.ndarray]
+    left: Callable[[], float]
+    seconds: float
+    path_seconds: float
+
+    def within(self, seconds: float) -> float:
+        """Return the seconds that a test may take: if renderings are counted, no more than are left."""
+        return min(seconds, max(self.left(), _LEAST_COUNTED)) if timing.counts() else seconds
+
+
 def _undetermined(
-    problem: Problem,
-    result: Result,
-    known: Curvature,
-    left: Callable[[], float],
-    tests: float,
-    path_seconds: float,
-    weights: Sequence[np.ndarray],
-    fits: bool,
-    complete: bool,
+    tests: _Tests, known: Curvature, fits: bool, complete: bool
 ) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray], list[str]]:
     """Return lines about what the images do not determine and about numbers that have not settled, standard errors, and keys of
     undetermined numbers; none without steps.
 
-    A final picture that does not fit the references (`fits`) has no standard errors. `complete`: see `render_final_images`.
-
-    Of `tests` seconds, a test takes at most about a quarter, unless renderings are counted: tests then take what is `left`, the most
-    telling ones first. A path takes `path_seconds`.
+    A final picture that does not fit the references (`fits`) has no standard errors. `complete`: see `render_final_images`. A test takes
+    at most about a quarter of the time, unless renderings are counted: tests then take what is left, the most telling ones first.
     """
+    problem, result, within = tests.problem, tests.result, tests.within
+    most = tests.seconds if timing.counts() else 0.25 * tests.seconds
     if not result.steps:
         return [], (), {}, []
     sensitivities = known.sensitivity()
     lines = undetermined_cells(sensitivities)
-    most = tests if timing.counts() else 0.25 * tests
-
-    def within(seconds: float) -> float:
-        return min(seconds, max(left(), _LEAST_COUNTED)) if timing.counts() else seconds
-
     seconds = min(max(_LOOK_SHARE * seconds_of_steps(result), _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
     per_pass, stated = _pass_spp(problem), result.standard_error
@@ -263,16 +266,18 @@ def _undetermined(
     of_numbers = allowed
     if timing.counts():
         of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
-    numbers = check_numbers(problem, result.parameters, result.initial, of_numbers, sensitivities, weights, stated)
+    numbers = check_numbers(
+        problem, result.parameters, result.initial, of_numbers, sensitivities, tests.weights, stated
+    )
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
-    limits = within(seconds), per_pass, within(most), sensitivities, deviations, path_seconds
+    limits = within(seconds), per_pass, within(most), sensitivities, deviations, tests.path_seconds
     lines += without_known(factors, result.parameters, deviations if fits else {})
     lines += undetermined(problem, result.parameters, spp, *limits)
     told = names_in("\n".join(line for line in lines if TOO_SHORT not in line), problem.unknowns)  # and tested
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
-    limits = within(seconds), per_pass, within(most), path_seconds
-    lines += blurred_cells(problem, result.parameters, known, spp, *limits) if left() > 0.0 else []
+    limits = within(seconds), per_pass, within(most), tests.path_seconds
+    lines += blurred_cells(problem, result.parameters, known, spp, *limits) if tests.left() > 0.0 else []
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])

@@ -215,8 +215,8 @@ def map_keys(problem: Problem) -> list[str]:
 
 
 def mask_roots(problem: Problem, view: int) -> np.ndarray:
-    """Return the roots of the weights of a view's pixels, (H, W, 1)."""
-    return np.sqrt(np.asarray(problem.test_weights(view), np.float64))[..., None]
+    """Return the roots of the weights of a view's pixels, times the view's unit, (H, W, 1)."""
+    return np.sqrt(np.asarray(problem.test_weights(view), np.float64))[..., None] * problem.units[view]
 
 
 def transposed(

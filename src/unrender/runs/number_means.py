@@ -252,7 +252,6 @@ def long_run_variance(values: np.ndarray) -> tuple[float, float]:
 
 
 def _without_trend(values: np.ndarray) -> np.ndarray:
-    """Return the values minus the straight line of least squares."""
     places = np.arange(len(values)) - 0.5 * (len(values) - 1)
     return values - (places @ values) / (places @ places) * places
 

@@ -268,9 +268,8 @@ def residuals_of_views(
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
     finite = np.isfinite(residuals.sum(axis=(0, 2)))
-    units = np.repeat(np.array([problem.units[view] for view in views], np.float32), [math.prod(of) for of in sizes])
-    residuals = np.where(finite[:, None], residuals * units[:, None], 0.0)
-    return residuals, pixels * units[:, None], weights * finite / units**2, sizes
+    units = np.repeat(np.array(problem.units, np.float32)[list(views)], [math.prod(of) for of in sizes])[:, None]
+    return np.where(finite[:, None], residuals * units, 0.0), pixels * units, weights * finite, sizes
 
 
 def compares(problem: Problem) -> bool:

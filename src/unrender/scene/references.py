@@ -153,7 +153,6 @@ def _size(picture: Any) -> int:
 
 
 def _rows(picture: Any, pixels: np.ndarray, channels: int) -> np.ndarray:
-    """Return the values of these pixels, (N, C)."""
     if isinstance(picture, StoredPicture):
         return picture.rows(pixels)
     return np.asarray(picture).reshape(-1, channels)[pixels]
@@ -285,10 +284,10 @@ class ViewLosses:
     def test_weights(self, view: int, images: Sequence[np.ndarray] = ()) -> np.ndarray:
         """Return the weight (H, W) of each pixel's square in tests of pictures: the mask's, and 0 for lower bounds of `Censored`.
 
-        Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there. Views of AOVs
-        beside others have the mask's times the squares of `units`, so that their references count as those of colour.
+        Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there. Residuals of AOVs
+        beside other views are multiplied by `units`, so that their references count as those of colour.
         """
-        weights = self.views[view].pixel_weights(self.sizes[view]) * self.units[view] ** 2
+        weights = self.views[view].pixel_weights(self.sizes[view])
         if not isinstance(self.loss, Censored):
             return weights
         return weights * determined_pixels(

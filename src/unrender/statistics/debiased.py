@@ -133,5 +133,4 @@ def _mean_of_pairs(total: float, rows: np.ndarray) -> np.ndarray:
 
 
 def _jackknife_error(without: np.ndarray) -> float:
-    """Return the standard error of an estimate from those without each of n samples, (n,)."""
     return math.sqrt((len(without) - 1) * float(np.var(without)))

@@ -41,7 +41,6 @@ def _neighbours_agree(values: np.ndarray) -> bool:
 
 
 def _with_neighbours(values: np.ndarray) -> np.ndarray:
-    """Return the sums over each pixel and its eight neighbours, (n, H, W)."""
     from scipy.ndimage import uniform_filter1d  # takes long to import
 
     for axis in (1, 2):

@@ -18,14 +18,13 @@ from unrender.app.capture import (
     pictures,
     problem_folder,
     silhouettes,
-    turntable,
     writing,
 )
 from unrender.app.capture import mesh as meshes
 from unrender.app.capture.capture import Capture, StoredViews, reinterpreted
 from unrender.app.capture.formats import lights
 from unrender.app.capture.mesh import Mesh
-from unrender.app.capture.silhouettes import Silhouettes, overlap
+from unrender.app.capture.silhouettes import Silhouettes, overlap, stands_still
 from unrender.app.capture.unknowns import DEFAULT, OF_HULL, parse
 from unrender.app.capture.views import prepare
 from unrender.app.evaluation.measures import fitted, sheet
@@ -338,7 +337,7 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
             raise InputError(f"{folder}: {hull.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
         refusal = "" if mean >= hull.SUFFICIENT else hull.explain(capture, training, own_mesh, mean)
-    turned = turntable.stands_still(views) if options.turntable is None else options.turntable
+    turned = stands_still(views) if options.turntable is None else options.turntable
     if turned and options.turntable is None:
         notices.append(TURNTABLE)
     if "response" in options.chosen(DEFAULT) and not turned:
@@ -347,7 +346,6 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
 
 
 def _has_masks(capture: Capture) -> bool:
-    """Return whether the capture has mask files, or files that can have an alpha channel."""
     return any(
         p.mask is not None or p.file.suffix.lower() in (".exr", ".png", ".tif", ".tiff", ".webp")
         for p in capture.photographs
@@ -355,7 +353,6 @@ def _has_masks(capture: Capture) -> bool:
 
 
 def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:
-    """Return the contact sheet of the views of `silhouettes.chosen`."""
     overlaps = [f"IoU {value:.3f}  " for value in data.overlaps] or [""] * len(data.views)
     names = [view.name for view in data.views.bare()]
     labels = [f"{overlaps[index]}{printable(names[index])}" for index in silhouettes.chosen(len(names))]

@@ -143,7 +143,6 @@ def _decode(path: Path) -> np.ndarray | None:
 
 
 def _header(path: Path) -> image_size.Header:
-    """Return the header of a photograph or mask. Raise `InputError` if its kind is not supported, or it is too large."""
     try:
         header = image_size.read_photograph_header(path)
     except InputError as error:

@@ -13,8 +13,7 @@ import numpy as np
 from unrender.app.capture import unknowns, writing
 from unrender.app.capture.capture import INSIDE, CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
-from unrender.app.capture.silhouettes import Silhouettes
-from unrender.app.capture.turntable import light_turns
+from unrender.app.capture.silhouettes import Silhouettes, light_turns
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file

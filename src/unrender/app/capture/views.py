@@ -143,7 +143,6 @@ class _Mask:
 
 
 def _check_masks(masks: Sequence[_Mask]) -> None:
-    """Raise `InputError` for masks that are empty or inverted: the object touches more than half of the picture's edge."""
     empty = [mask.name for mask in masks if mask.share < _EMPTY]
     if empty:
         raise InputError(f"mask of {printable(empty[0])}: empty (black); {len(empty)} of {len(masks)} masks are so")

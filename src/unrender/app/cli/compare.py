@@ -158,7 +158,6 @@ def _spread(of: Spread) -> str:
 
 
 def _check_single(what: Sequence[str]) -> None:
-    """Raise `InputError` unless there is exactly one problem."""
     if len(what) > 1:
         missing = next(name for name in what if not Path(name).is_dir())
         what_is = "not a run folder" if Path(missing).exists() else "no such run folder"

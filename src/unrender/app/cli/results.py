@@ -262,7 +262,6 @@ def watch(
 
 
 def _similar(directory: Path) -> str:
-    """Return a hint at a sibling run folder with a similar name."""
     siblings: list[str] = []
     with contextlib.suppress(OSError):
         siblings = [path.name for path in directory.parent.iterdir() if path.is_dir()]

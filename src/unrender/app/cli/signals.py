@@ -154,7 +154,6 @@ class _Handler:
 
 
 def _leave(status: int) -> None:
-    """End the process at once, with its line."""
     if sys.stderr.isatty():
         os.write(2, _SHOW_CURSOR)
     os.write(2, f"unrender: {WORDS[status]}\n".encode())

@@ -267,7 +267,6 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
 
 
 def _replace_texture(graph: SceneGraph, index: int, value: np.ndarray) -> None:
-    """Replace a constant texture by its value in each of its parents."""
     for parent in range(len(graph.nodes)):
         for name, child in graph.children(parent).items():
             if child == index:

@@ -1,7 +1,6 @@
 """Rules of `auto`: functions from the traits of a problem to a plan, or to a part of one, with its reason.
 
-`RULES` choose the gradient estimator; the first rule that returns a plan decides. For path gradients, the rules in `kinds` decide for the
-unknowns of each kind, and those in `sampling` decide how images are rendered.
+`RULES` choose the gradient estimator; the first rule that returns a plan decides.
 """
 
 from unrender.methods.rules.newton import cameras, cameras_by_paths, few_numbers

@@ -21,16 +21,14 @@ from unrender.estimators.path_then_newton import PathThenNewton
 from unrender.estimators.variable_projection import IMAGES, can_be_eliminated
 from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods import effects
+from unrender.methods.base import measure
 from unrender.methods.plan import Plan
-from unrender.methods.rules import sampling
 from unrender.methods.rules.starts import best_start, stands_out
-from unrender.methods.rules.traits import Traits
+from unrender.methods.rules.traits import Traits, choose_sampler, samples_per_pixel, within
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.averaged_newton import AveragedNewton
-from unrender.optimizers.partitioned import Partitioned
+from unrender.optimizers.partitioned import Partitioned, Successive
 from unrender.optimizers.recipes import Adam
-from unrender.optimizers.successive import Successive
 from unrender.scene.executor import LocalExecutor
 from unrender.scene.problem import Problem
 from unrender.schedules import Exponential
@@ -46,7 +44,7 @@ def cameras(traits: Traits) -> Plan | None:
     of_cameras = traits.only_cameras or traits.cameras_and_lenses
     if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
         return None
-    spp = traits.options.spp or sampling.within(constants.image_spp, constants.image_paths // problem.pixels)
+    spp = traits.options.spp or within(constants.image_spp, constants.image_paths // problem.pixels)
     spp, derivative_spp = max(spp, 2), max(spp // constants.per_derivative, constants.fewest_derivative)
     reason = f"Gauss-Newton steps for cameras from perturbed renders {_samples(spp, derivative_spp)}; the mean of all steps' models"
     widths = widths_of(traits.options.sigma, problem, traits.poses)
@@ -59,8 +57,8 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
     """Return path gradients of sensors if an image or pixels are requested, or Gauss-Newton steps are unsuitable; else None."""
     if not traits.only_cameras or not all(info.differentiable for info in traits.infos.values()):
         return None
-    sampler, sampler_reason = sampling.sampler(traits)
-    spp = sampling.samples_per_pixel(traits, sampler)
+    sampler, sampler_reason = choose_sampler(traits)
+    spp = samples_per_pixel(traits, sampler)
     rate = traits.constants.camera_share * traits.options.learning_rate
     image = RecursiveControlVariate("primary") if traits.options.image == "rcv" else Plain()
     reason = f"path gradients of cameras, {spp} samples per pixel, Adam, first rate {rate:.3g}, halved every 30 steps"
@@ -104,7 +102,7 @@ def few_numbers(traits: Traits) -> Plan | None:
             return None
         # Noise hides what many lights explain; the loss smoothed over all of them rose.
         explained = traits.elements > constants.few_numbers or _explained(problem.initial(), problem, trial) > least
-        plateau = not (explained or effects.measure(problem, (stands_out,), lambda: stands_out(problem, traits.poses)))
+        plateau = not (explained or measure(problem, (stands_out,), lambda: stands_out(problem, traits.poses)))
     estimator = replace(estimator, shift=constants.pose_last_shift) if shapes else estimator
     why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
@@ -133,7 +131,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     eliminated = _eliminated(traits, keys, plan)
     images = 2 * _elements(traits, keys) + (IMAGES if eliminated else 0)
     traced = images * estimator.derivative_spp + estimator.spp
-    every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
+    every = within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
     # A texture that is fitted to a picture of a wrong lamp, lens or camera takes over its error.
     wait = constants.block_wait if any(traits.infos[key].shape_pose for key in keys) else 0
     optimizer = _optimizer(traits, keys)
@@ -166,12 +164,8 @@ def then_newton(traits: Traits, plan: Plan) -> Plan:
         return plan
     newton = replace(
         _estimator(traits, keys, 0.0),
-        spp=max(
-            traits.options.spp or sampling.within(constants.number_spp, constants.number_paths // problem.pixels), 2
-        ),
-        derivative_spp=sampling.within(
-            constants.difference_spp, constants.number_paths // (traits.elements * problem.pixels)
-        ),
+        spp=max(traits.options.spp or within(constants.number_spp, constants.number_paths // problem.pixels), 2),
+        derivative_spp=within(constants.difference_spp, constants.number_paths // (traits.elements * problem.pixels)),
         remember=True,
         derivative_noise=constants.derivative_noise,
     )
@@ -196,7 +190,7 @@ def _by_channel(traits: Traits, estimator: GaussNewton) -> GaussNewton:
 def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
     """Return the result of `_predicted`, of equal arguments once for all plans of a check."""
     key = (repr(estimator), *(arrays.numpy(value).tobytes() for value in first.values()))
-    return effects.measure(problem, key, lambda: _predicted(first, problem, estimator))
+    return measure(problem, key, lambda: _predicted(first, problem, estimator))
 
 
 def _predicted(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
@@ -284,14 +278,12 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
     moved = [key for key in keys if key in traits.poses]
     poses = [key for key in moved if not traits.infos[key].light]
-    differences = sampling.within(
-        constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels)
-    )
+    differences = within(constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels))
     renders, least = 2 * elements * differences * problem.pixels, constants.block_paths
     if images >= 1.0:  # no block: states that differ in poses only are rendered together
         renders, least = cost(renders, 4 if len(moved) == len(keys) else 4 * elements), constants.number_paths
     paths = max(least, round(renders * images)) // problem.pixels
-    spp = traits.options.spp or sampling.within(constants.number_spp, paths)
+    spp = traits.options.spp or within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
     reach = constants.pose_reach if poses else constants.light_reach
     shift = constants.camera_shift if any(traits.infos[key].viewpoint for key in poses) else constants.pose_shift

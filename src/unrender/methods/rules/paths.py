@@ -23,10 +23,9 @@ from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images.base import Plain
 from unrender.methods.base import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import sampling
 from unrender.methods.rules.constants import CONSTANTS, Constants
 from unrender.methods.rules.newton import then_newton, with_separate_block
-from unrender.methods.rules.traits import Traits, refusal
+from unrender.methods.rules.traits import Traits, choose_image, choose_sampler, refusal, samples_per_pixel
 from unrender.methods.smoothed import first_steps, parse_widths
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.partitioned import Partitioned
@@ -191,9 +190,9 @@ def paths(traits: Traits) -> Plan:
     configured = problem.configured(settings)
     rates = {**first_rates(configured, options.learning_rate, traits.constants), **traits.rates}
     rates = {key: rate for key, rate in rates.items() if key not in traits.block}
-    sampler, reason = sampling.sampler(traits)
-    image, image_reason = sampling.image(traits, sampler)
-    spp = sampling.samples_per_pixel(traits, sampler)
+    sampler, reason = choose_sampler(traits)
+    image, image_reason = choose_image(traits, sampler)
+    spp = samples_per_pixel(traits, sampler)
     smoothed = tuple(key for part in parts if part.smoothed for key in part.keys)
     own, pulled = [part for part in parts if part.optimizer], _pulled(traits, settings)
     apart = {key for part in own for key in part.keys}
@@ -311,7 +310,6 @@ def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS
 
 
 def _owner(key: str) -> str:
-    """Return the material of a texture from the key of its data."""
     return key.rsplit(".", 2)[0]
 
 

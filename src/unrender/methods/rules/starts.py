@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.methods import effects
+from unrender.methods.base import measure
 from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations import Bounds
@@ -67,7 +67,7 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
     if not varied or (colours and not plateau):
         return plan
     initial = {key: u.initial if u.first is None else u.first for key, u in problem.unknowns.items()}
-    place = effects.measure(
+    place = measure(
         traits.problem,
         ("place", repr(plan.settings), *varied, *lights, plateau),
         lambda: better_place(
@@ -325,7 +325,6 @@ def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
 
 
 def _owner(key: str) -> str:
-    """Return the name of what a pose moves."""
     parts = key.split(".")
     return ".".join(parts[: next((i for i, part in enumerate(parts) if part in _MOTIONS), len(parts))])
 

@@ -138,7 +138,6 @@ class ScheduleFreeAverage(checks.Checked, StepTransform):
         return replace(update, steps=steps), Iterates(fast, average)
 
     def _between(self, fast: Array, average: Array) -> Array:
-        """Return y."""
         return fast + self.beta * (average - fast)
 
     def _within_bounds(self, fast: Array, average: Array, y: Array, least: float) -> tuple[Array, Array]:

@@ -63,7 +63,6 @@ def contact_notices(scene: Any, keys: Collection[str]) -> list[str]:
 
 
 def _meets(box: Any, low: Any, high: Any) -> np.ndarray:
-    """Return whether a bounding box meets boxes from `low` to `high`, (N, 3) or (3,)."""
     return ((np.array(box.min) <= high) & (low <= np.array(box.max))).all(axis=-1)
 
 
@@ -194,5 +193,4 @@ def _jumps(texture: Any) -> bool:
 
 
 def _unknown_meshes(scene: Any, keys: Collection[str]) -> list[Any]:
-    """Return the meshes whose vertices are among these parameters."""
     return [shape for shape in scene.shapes() if f"{shape.id()}.{mesh_layout.POSITIONS}" in keys]

@@ -359,7 +359,6 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _index(value: Any) -> tuple[int, ...]:
-    """Return the indices of the Dr.Jit variables of an array."""
     value = dr.detach(value)
     if dr.is_tensor_v(value):
         return (value.array.index,)

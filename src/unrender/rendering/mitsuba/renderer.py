@@ -291,7 +291,6 @@ class MitsubaRenderer:
         return lit and key in scene.poses
 
     def _check_targets(self, keys: list[str]) -> None:
-        """Raise `InputError` if two parameters place the same object."""
         poses.slots({key: self._poses[key] for key in keys if key in self._poses})
         written = self.pair.loaded().poses
         for key in keys:

@@ -178,7 +178,6 @@ def all_shapes(scene: Any) -> list[Any]:
 
 
 def _is_moved(instance: Any) -> bool:
-    """Return whether the transform of an instance is not the identity."""
     to_world: Any = mi.traverse(instance)["to_world"]
     return not np.allclose(np.array(to_world.matrix).reshape(4, 4), np.eye(4))
 

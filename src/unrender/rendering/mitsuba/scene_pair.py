@@ -378,7 +378,6 @@ class ScenePair:
         )
 
     def _obstacle(self, key: str) -> str:
-        """Return the reason why a parameter cannot be set to another value; "" if it can."""
         return update_obstacle(self.current_parameters, key) or self._current.colours.obstacle(key)
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:

@@ -173,7 +173,6 @@ def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _finished(root: Path) -> list[Path]:
-    """Return the finished checkpoints, oldest first."""
     if not root.is_dir():
         return []
     named = [path for path in root.iterdir() if _NAME.fullmatch(path.name)]

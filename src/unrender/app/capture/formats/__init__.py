@@ -105,7 +105,6 @@ def _check_places(capture: Capture, masks: Path | None) -> None:
 
 
 def _check_photographs(capture: Capture) -> None:
-    """Raise `InputError` if a photograph has two cameras."""
     cameras: dict[Path, np.ndarray] = {}
     for photograph in capture.photographs:
         pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
@@ -116,7 +115,6 @@ def _check_photographs(capture: Capture) -> None:
 
 
 def _check_masks(capture: Capture) -> None:
-    """Raise `InputError` if two photographs share a mask."""
     owners: dict[Path, Path] = {}
     for photograph in capture.photographs:
         if photograph.mask is not None:

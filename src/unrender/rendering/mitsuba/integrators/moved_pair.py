@@ -286,7 +286,6 @@ class MovedPair:
         return (path.depth + 2 < self.max_depth) | tables["lights"].meet(ray, mi.Float(dr.inf))
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
-        """Return which lanes survive Russian roulette, and their throughput."""
         most = dr.max(β)
         q = dr.minimum(most * dr.square(η), 0.95)
         roulette = depth >= self.rr_depth

@@ -123,7 +123,6 @@ def _slots(graph: ObjectGraph, node: Any, leaf: str) -> Iterator[tuple[Any, Any]
 
 
 def _below(graph: ObjectGraph, node: Any) -> Iterator[Any]:
-    """Yield all objects that an object holds, recursively."""
     for other, owners in graph.owners.items():
         if node in owners:
             yield other
@@ -131,7 +130,6 @@ def _below(graph: ObjectGraph, node: Any) -> Iterator[Any]:
 
 
 def _check_around(owner: Any, around: Sequence[Any]) -> None:
-    """Raise `ValueError` for a holder that is neither a BSDF around a BSDF nor a shape or scene."""
     for item in around:
         if isinstance(owner, mi.Emitter) or not isinstance(item, mi.BSDF):
             raise ValueError(f"it is inside a {item.class_name()}")
