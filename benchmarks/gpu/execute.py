@@ -10,30 +10,31 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.gpu import outcomes
 from benchmarks.gpu.plan import Command, Folder, Slice, State
 from benchmarks.runner.catalogue import ROOT
 
 _GRACE = 10.0
 """Seconds from the request to end to the end by force; a part of the minutes."""
 
-_PYTEST_ENDS = (0, 5)
-"""Status of pytest where no test of this process failed; 5: where none was left."""
-
 
 def words(part: Slice, command: Command, folder: Folder) -> list[str]:
     """The command line."""
-    where = folder.path / part.name
     arguments = command.arguments(folder.is_toy)
     match command.name:
         case "doctor":
             return [sys.executable, "-m", "unrender", "doctor", *arguments]
         case "tests":
-            own = ["-q", "-n", "auto", "--dist", "loadfile", "-p", "benchmarks.gpu.outcomes", "--outcomes"]
-            return [sys.executable, "-m", "pytest", *own, str(where / "tests.jsonl"), *arguments]
+            return [sys.executable, "-m", "pytest", "-q", "-n", "auto", "--dist", "loadfile", *arguments]
         case name:
-            beside = _relative(where / name)
-            return [sys.executable, "-m", "benchmarks", name, *arguments, "--out", beside]
+            return [
+                sys.executable,
+                "-m",
+                "benchmarks",
+                name,
+                *arguments,
+                "--out",
+                _relative(folder.path / part.name / name),
+            ]
 
 
 def run_slice(part: Slice, folder: Folder, where: State, minutes: float) -> str:
@@ -44,7 +45,7 @@ def run_slice(part: Slice, folder: Folder, where: State, minutes: float) -> str:
         folder: of states and records.
         where: the device.
         minutes: for the whole slice; a command that would go on is ended, and noted as cut short. The next time it begins
-            anew, and tests go on.
+            anew.
     """
     until = time.monotonic() + 60 * minutes
     for number, command in enumerate(part.commands):
@@ -56,12 +57,6 @@ def run_slice(part: Slice, folder: Folder, where: State, minutes: float) -> str:
         log = ROOT / "out" / "benchmarks" / ("gpu-toy" if folder.is_toy else "gpu") / f"{part.name}-{number}.log"
         print(f"{part.name}: {command.words}", flush=True)
         entry = _run(words(part, command, folder), log, seconds, where)
-        tests = folder.path / part.name / "tests.jsonl"
-        if command.name == "tests" and tests.is_file():
-            found = outcomes.counts(tests)
-            if entry["ended"] != "cut short" and entry.get("status", 0) in _PYTEST_ENDS:
-                entry["ended"] = "done" if found and found.keys() <= {"passed", "skipped"} else "failed"
-            entry["tests"] = found
         folder.note(part, command, where, entry)
         print(f"  {entry['ended']} after {entry['seconds']:.0f} s; {_relative(log)}", flush=True)
     return folder.summary(part)
@@ -87,7 +82,9 @@ def _run(line: list[str], log: Path, seconds: float, where: State) -> State:
         "date": time.strftime("%Y-%m-%d %H:%M"),
     }
     if status:
-        entry |= {"status": status, "last_line": _last_line(log)}
+        entry["status"] = status
+    if status or "pytest" in line:  # the last line of tests has their number
+        entry["last_line"] = _last_line(log)
     return entry
 
 

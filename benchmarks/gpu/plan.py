@@ -109,7 +109,7 @@ class Folder:
     """Where states and records are.
 
     Attributes:
-        path: with `<slice>.json`, `<slice>/<benchmark>/results.json`, and, of tests, `<slice>/tests.jsonl`.
+        path: with `<slice>.json` and `<slice>/<benchmark>/results.json`.
         is_toy: of toy sizes.
     """
 
@@ -122,9 +122,8 @@ class Folder:
         return json.loads(file.read_text()) if file.is_file() else {}
 
     def forget(self, part: Slice) -> None:
-        """Make the slice one that never ran. Records of benchmarks stay until they are written anew; those of tests are removed."""
+        """Make the slice one that never ran. Records of benchmarks stay until they are written anew."""
         (self.path / f"{part.name}.json").unlink(missing_ok=True)
-        (self.path / part.name / "tests.jsonl").unlink(missing_ok=True)
 
     def note(self, part: Slice, command: Command, where: State, entry: State) -> None:
         """Write what became of a command."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from benchmarks.gpu import cli, execute, outcomes
+from benchmarks.gpu import cli, execute
 from benchmarks.gpu.plan import FULL, SLICES, Command, Folder, Slice, device
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.options import add_options
@@ -148,45 +146,6 @@ def test_next_goes_through_the_plan(folder: Folder, tmp_path: Path, monkeypatch:
         assert cli.main(["--next", "--copy", str(tmp_path / "copy")]) == 0
         assert len(list((tmp_path / "copy").glob("*.json"))) == number
         assert [folder.summary(part) == "done" for part in SLICES[:3]] == [True] * number + [False] * (3 - number)
-
-
-TESTS = """
-import os, pathlib
-def test_good(): pass
-def test_bad(): assert 1 == 2
-def test_fatal():
-    if pathlib.Path("fatal").exists(): os._exit(9)
-def test_last(): pass
-"""
-
-
-@pytest.mark.slow
-def test_tests_go_on_after_the_process_has_ended(tmp_path: Path) -> None:
-    (tmp_path / "test_some.py").write_text(TESTS)
-    (tmp_path / "fatal").touch()
-    file = tmp_path / "tests.jsonl"
-    line = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:xdist",
-        "-p",
-        "benchmarks.gpu.outcomes",
-        "--outcomes",
-        str(file),
-    ]
-    line += ["-c", str(tmp_path / "none.ini"), "--rootdir", str(tmp_path), "test_some.py"]
-    (tmp_path / "none.ini").write_text("[pytest]\n")
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'src'}"}
-    for expected in (
-        {"passed": 1, "failed": 1},
-        {"passed": 1, "failed": 1, "ended the process": 1},
-        {"passed": 2, "failed": 1, "ended the process": 1},
-    ):
-        subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, check=False)
-        assert outcomes.counts(file) == expected
 
 
 @pytest.mark.mitsuba

@@ -33,9 +33,7 @@ def picture(problem: ur.Problem, point: np.ndarray) -> np.ndarray:
 
 
 def run(
-    task: tuple[str, ...] = tuple(name for name in TASKS if name != "QUAD"),
-    resolution: int = 32,
-    seconds: float = 0.5,
+    task: tuple[str, ...] = tuple(name for name in TASKS if name != "QUAD"), resolution: int = 32, seconds: float = 0.5
 ) -> dict[str, Any]:
     """All tasks.
 

@@ -43,13 +43,7 @@ QUICK = {"task": ("MUG",), "method": ("FR22", "OurJoint"), "runs": 2, "resolutio
 
 
 def descend_by(
-    name: str,
-    task: Task,
-    method: str,
-    problem: ur.Problem,
-    config: Config,
-    number: int,
-    evaluations: float = math.inf,
+    name: str, task: Task, method: str, problem: ur.Problem, config: Config, number: int, evaluations: float = math.inf
 ) -> Descent:
     """One run, of so many `Descent.evaluations` at most where ours runs it."""
     unit = 1.0 if method == "CMA-ES" else config.get("rate")

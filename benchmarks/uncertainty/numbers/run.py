@@ -62,10 +62,7 @@ def _coverage(scores: list[list[float]], seeds: int) -> dict[str, Any]:
 
 
 def run(
-    problems: tuple[str, ...] = ("lamp", "glass", "sun"),
-    seeds: int = 100,
-    folder_seeds: int = 20,
-    steps: int = 16,
+    problems: tuple[str, ...] = ("lamp", "glass", "sun"), seeds: int = 100, folder_seeds: int = 20, steps: int = 16
 ) -> Iterator[dict[str, Any]]:
     """Coverage of each problem.
 
