@@ -47,12 +47,10 @@ class _Recorder(ur.protocols.Callback):
     def __init__(self) -> None:
         self.path: list[Tree] = []
 
-    def on_start(self, run: Any) -> None:
+    def on_start(self, run: Any, *_: Any) -> None:
         self.path.append(dict(run.parameters))
 
-    def on_step(self, run: Any, record: Any) -> None:
-        del record
-        self.path.append(dict(run.parameters))
+    on_step = on_start
 
 
 def descent(

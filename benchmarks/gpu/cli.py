@@ -7,11 +7,9 @@ python -m benchmarks gpu --toy             run the whole plan at toy sizes, on w
 from __future__ import annotations
 
 import argparse
-import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from benchmarks.gpu.execute import run_slice
 from benchmarks.gpu.plan import FULL, SLICES, TOY, Folder, Slice, device
@@ -28,7 +26,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--toy", action="store_true", help="toy sizes, on the processor where no GPU works")
     parser.add_argument("--minutes", type=float, default=10.0, help="for a slice; what goes on is ended (10)")
     parser.add_argument("--again", action="store_true", help="what has ended, too")
-    parser.add_argument("--copy", type=Path, help="copy states and records there after each slice")
     parser.add_argument("--list", action="store_true", help="only list; with --toy, what became of the toy plan")
     given = parser.parse_args(arguments)
     folder = TOY if given.toy else FULL
@@ -47,8 +44,6 @@ def main(arguments: Sequence[str]) -> int:
             if given.again:
                 folder.forget(part)
             ends.append(run_slice(part, folder, where, given.minutes))
-            if given.copy:
-                shutil.copytree(folder.path, given.copy, dirs_exist_ok=True)
     finally:
         signal.signal(signal.SIGTERM, before)
     for part, end in zip(chosen, ends, strict=True):

@@ -136,15 +136,15 @@ def test_the_list_has_a_line_for_each_slice(capsys: pytest.CaptureFixture[str]) 
     assert [line.split()[0] for line in told] == [part.name for part in SLICES]
 
 
-def test_next_goes_through_the_plan(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_goes_through_the_plan(folder: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli, "FULL", folder)
     monkeypatch.setattr(variant, "gpu_problem", lambda: None)
     monkeypatch.setattr(cli, "device", lambda on_gpu: NOWHERE)
     monkeypatch.setattr(execute, "words", lambda part, command, folder: [sys.executable, "-c", ""])
     folder.path.mkdir()
     for number in range(1, 3):
-        assert cli.main(["--next", "--copy", str(tmp_path / "copy")]) == 0
-        assert len(list((tmp_path / "copy").glob("*.json"))) == number
+        assert cli.main(["--next"]) == 0
+        assert len(list(folder.path.glob("*.json"))) == number
         assert [folder.summary(part) == "done" for part in SLICES[:3]] == [True] * number + [False] * (3 - number)
 
 

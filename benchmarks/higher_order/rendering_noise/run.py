@@ -72,9 +72,7 @@ def table(record: Record) -> str:
             cells = [f"{statistics.median(f):.4f} (to {max(f):.3f})" for f in finals]
             rows.append([name, method, *cells, *(f"{t:.0f}" if math.isfinite(t) else "—" for t in times)])
     head = ["task | method", *(f"final, {c} spp" for c in counts), *(f"to 90 %, {c} spp" for c in counts)]
-    text = (
-        "{renders} renders, {runs} runs: median final error of the parameters (worst), and median renders to a tenth."
-    )
+    text = "{renders} renders, {runs} runs: median final error of the parameters (worst), median renders to a tenth."
     return markdown.blocks(text.format(**record["settings"]), markdown.table(" | ".join(head), rows))
 
 

@@ -100,10 +100,9 @@ def run(
 
 
 def table(record: Record) -> str:
+    text = "`ajar`, {resolution}², {seconds:g} s, at 16 spp over equal steps, {seeds} seeds, each tuned."
     blocks = [
-        "`ajar`, {resolution}², {seconds:g} s, at 16 spp over equal steps, {seeds} seeds, each tuned.".format(
-            **record["settings"]
-        ),
+        text.format(**record["settings"]),
         markdown.records(
             "form, and what is left out | rate | final error: median (range)",
             "{name} | {rate:g} | {final!m}",

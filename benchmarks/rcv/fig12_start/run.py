@@ -91,6 +91,5 @@ def table(record: Record) -> str:
         rows.append([found["alpha"], found["name"], weights, squares, f"{worst:.1f}", found["forgotten_after"]])
     head = "α | mean | weight of the first value after 10 / 50 / 200 | mean square | largest z against the closed form"
     head += " | values until the first weighs 1 − α or less"
-    return markdown.blocks(
-        f"{record['settings']['sequences']} sequences of normal variates.", markdown.table(head, rows)
-    )
+    text = "{sequences} sequences of normal variates."
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))

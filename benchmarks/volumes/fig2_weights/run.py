@@ -73,9 +73,7 @@ def run(steps: int = 250, spp: int = 4, runs: int = 16, seeds: int = 3, resoluti
 def table(record: Record) -> str:
     last = len(record["weight"]) - 1
     row = "{0} | {{weight[{0}]:.3f}} | {{weight_10_50_90[1][{0}]:.3f}} | {{variance_ratio[{0}]:.3f}} ± {{variance_ratio_error[{0}]:.3f}}"
-    rows = [
-        [markdown.fill(row.format(n), record)] for n in (1, 5, 20, 50, 100, 200, 500, last) if n < last or n == last
-    ]
+    rows = [[markdown.fill(row.format(n), record)] for n in sorted({1, 5, 20, 50, 100, 200, 500, last}) if n <= last]
     keys = list(record["errors"]["rcv"])
     ends = [[method, *(_median(runs[key]) for key in keys)] for method, runs in record["errors"].items()]
     text = "`three-bodies`, {resolution}², {spp} spp, L1, Adam at 0.01, {steps} steps; weights and variance over {runs} runs along one "
