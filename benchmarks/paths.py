@@ -47,7 +47,7 @@ class _Recorder(ur.protocols.Callback):
     def __init__(self) -> None:
         self.path: list[Tree] = []
 
-    def on_start(self, run: Any, *_: Any) -> None:
+    def on_start(self, run: Any, record: Any = None) -> None:
         self.path.append(dict(run.parameters))
 
     on_step = on_start

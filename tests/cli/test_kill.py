@@ -100,6 +100,7 @@ def check_readable(folder: Path) -> None:
 
 
 def kill_analytic(killer: Killer, tmp_path: Path, kills: int, seed: int) -> None:
+    """Kill each case in the first, the second and the last third of its run, in turn."""
     dice = random.Random(seed)
     cases = list(CASES)
     dice.shuffle(cases)
@@ -107,6 +108,7 @@ def kill_analytic(killer: Killer, tmp_path: Path, kills: int, seed: int) -> None
     died = number = 0
     while died < kills:
         case = cases[number % len(cases)]
+        third = number // len(cases) % 3
         number += 1
         whole = tmp_path / f"{case}-whole"
         if case not in seconds:
@@ -115,7 +117,7 @@ def kill_analytic(killer: Killer, tmp_path: Path, kills: int, seed: int) -> None
             seconds[case] = time.perf_counter() - started
         folder = tmp_path / f"{case}-{number}"
         every = dice.choice((1, 1, 2, 5))
-        while killer.live(case, folder, every, dice.uniform(0, 1.1) * seconds[case]) == -signal.SIGKILL:
+        while killer.live(case, folder, every, (third + dice.random()) * 1.1 / 3 * seconds[case]) == -signal.SIGKILL:
             died += 1  # and once more, while it is resumed, now and then
             check_readable(folder)
             if dice.random() < 0.6:
@@ -147,6 +149,7 @@ def wait_for_steps(process: subprocess.Popen[str], folder: Path, steps: int) -> 
 
 
 def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
+    """Kill each command in the first and in the second half of its steps, in turn."""
     dice = random.Random(seed)
     names = list(COMMANDS)
     died = number = 0
@@ -154,7 +157,7 @@ def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
     while died < kills:
         number += 1
         assert number < 4 * kills + 20
-        name = names[number % len(names)]
+        name, half = names[number % len(names)], number // len(names) % 2
         words = [
             *COMMANDS[name],
             "--steps",
@@ -171,7 +174,9 @@ def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
             statuses[name] = finish(command("run", *words, "--out", whole, "--checkpoint-every", 7))
             assert statuses[name] in ENDED
         process = command("run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3)))
-        wait_for_steps(process, folder, dice.randint(-3, COMMAND_STEPS))
+        wait_for_steps(
+            process, folder, dice.randint(*((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS))[half])
+        )
         time.sleep(dice.uniform(0, 0.05))
         process.kill()
         status = finish(process)
@@ -192,9 +197,9 @@ def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
 
 @pytest.mark.slow
 def test_many_are_killed(killer: Killer, tmp_path: Path) -> None:
-    kill_analytic(killer, tmp_path, 78, seed=3)
+    kill_analytic(killer, tmp_path, 3 * len(CASES), seed=3)
 
 
 @pytest.mark.slow
 def test_many_commands_are_killed(tmp_path: Path) -> None:
-    kill_commands(tmp_path, 22, seed=4)
+    kill_commands(tmp_path, 2 * len(COMMANDS), seed=4)

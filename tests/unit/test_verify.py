@@ -251,7 +251,7 @@ def test_a_shared_part_is_measured() -> None:
 # ---------------------------------------------------------------------- runs that are right
 
 
-@pytest.mark.parametrize("count", [4, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(4), slow(range(4, 150))], ids=str)
 @pytest.mark.parametrize(
     "estimator",
     [
@@ -262,8 +262,8 @@ def test_a_shared_part_is_measured() -> None:
     ],
     ids=["plain", "control variate", "control variate of mini-batches", "meta"],
 )
-def test_runs_that_succeed_are_finished(estimator: Any, count: int) -> None:
-    for seed in range(count):
+def test_runs_that_succeed_are_finished(estimator: Any, seeds: range) -> None:
+    for seed in seeds:
         result = ur.optimize(made(seed % 7), estimator, ur.optimizers.Adam(0.03), steps=70, seed=seed)
         assert result.status == "finished", (seed, result.warnings, result.verification)
         assert result.verification["end"][0] < result.verification["start"][0]
@@ -517,10 +517,10 @@ def test_references_without_a_known_truth_may_differ_by_a_quarter_as_photographs
     assert result.status == status
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(3), slow(range(3, 100))], ids=str)
 @pytest.mark.parametrize("rate", [slow(0.02), 0.2])
-def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: int) -> None:
-    for seed in range(count):
+def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, seeds: range) -> None:
+    for seed in seeds:
         result = ur.optimize(smooth(0.0, seed), RCV, ur.optimizers.Adam(rate), steps=200, seed=seed)
         assert not any(UNEXPLAINED in line for line in result.warnings), (seed, result.warnings)
         assert result.status == "finished"
@@ -594,11 +594,13 @@ def test_light_that_no_unknown_explains_is_told_in_short_runs(steps: int) -> Non
 
 
 @pytest.mark.parametrize(
-    ("steps", "count"), [(10, 2), *(pytest.param(n, 20, marks=pytest.mark.slow) for n in (10, 24, 48))]
+    ("steps", "seeds"),
+    [(10, range(2)), slow(10, range(2, 20)), slow(24, range(20)), slow(48, range(20))],
+    ids=["10", "10-more", "24", "48"],
 )
-def test_short_runs_that_converge_or_are_incomplete_have_nothing_unexplained(steps: int, count: int) -> None:
+def test_short_runs_that_converge_or_are_incomplete_have_nothing_unexplained(steps: int, seeds: range) -> None:
     """Gauss-Newton steps arrive, and those of Adam are incomplete, also with references whose noise is a tenth of the picture."""
-    for seed in range(count):
+    for seed in seeds:
         problem = smooth(0.0, seed)
         if seed % 2:
             noise = 0.1 * np.random.default_rng(seed).standard_normal((WIDE, WIDE, 3))
@@ -653,13 +655,13 @@ def test_a_local_minimum_of_few_pixels_is_told(side: int, known: bool) -> None:
         assert result.status == "does not fit"
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(2), slow(range(2, 50))], ids=str)
 @pytest.mark.parametrize(("grain", "known"), [slow(0.0, False), (0.05, False), slow(0.0, True), (0.3, True)])
 @pytest.mark.parametrize("side", [1, 4])
 def test_few_pixels_that_have_converged_have_nothing_unexplained(
-    side: int, grain: float, known: bool, count: int
+    side: int, grain: float, known: bool, seeds: range
 ) -> None:
-    for seed in range(count):
+    for seed in seeds:
         problem = tiny(side, 2.0, seed, grain, known)
         result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.02), steps=200, seed=seed)
         assert not any(UNEXPLAINED in line for line in result.warnings), (seed, result.warnings)
