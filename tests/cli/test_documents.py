@@ -42,16 +42,8 @@ SLOW = {
     "quickstart.md",
     *("material.md", "light.md", "medium.md", "pose.md", "mesh.md", "camera.md", "any-function.md", "photographs.md"),
     *("own-loop.md", "own-estimator.md", "losses.md", "speed.md", "stages.md", "sweeps.md", "runs.md", "watching.md"),
-    *(
-        "texture.md",
-        "exporting.md",
-        "surfaces.md",
-        "volumes.md",
-        "poses.md",
-        "lamps.md",
-        "parameterisations.md",
-        "light-pose.md",
-    ),
+    *("exporting.md", "surfaces.md", "volumes.md", "poses.md", "lamps.md", "parameterisations.md", "light-pose.md"),
+    *("texture.md", "command-line.md"),
 }
 
 # What the example of a docstring takes as given.

@@ -49,6 +49,7 @@ def test_an_out_folder_that_is_not_utf_8_is_refused_before_the_work(locale: str,
     assert not os.path.exists(os.fsencode(tmp_path) + b"/caf\xe9")
 
 
+@pytest.mark.slow
 def test_a_working_folder_that_is_not_utf_8_is_refused_before_the_work(problem: Path, tmp_path: Path) -> None:
     """The problem's own path goes into run.json, too."""
     folder = os.fsencode(tmp_path) + b"/caf\xe9"

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = """
 import sys
 import numpy as np
@@ -32,6 +34,7 @@ assert dr.thread_count() == 1
 """
 
 
+@pytest.mark.slow
 def test_exr_files_are_read_and_written(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", "import unrender as ur; ur.use('llvm_ad_rgb')\n" + SCRIPT, str(tmp_path)],

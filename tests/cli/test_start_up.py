@@ -80,6 +80,7 @@ def test_help_costs_few_imports() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_run_imports_what_its_end_needs_at_its_end() -> None:
     needed = imported(WHEN_NEEDED)
     late = {

@@ -110,6 +110,7 @@ def leaf() -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", quick(AOVS, "depth"))
 @pytest.mark.parametrize("masked", quick([False, True], True))
 def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRenderer, name: str, masked: bool) -> None:

@@ -94,6 +94,7 @@ def test_few_frames_lead_to_a_bounce_that_is_traced_at_each_step(
     assert not recorder.faults()
 
 
+@pytest.mark.slow
 def test_a_call_that_only_forwards_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A method of one line around each launch, twice, as if it stood in our source."""
     text = "def forwarding(inner):\n    def call(*given):\n        return inner(*given)\n    return call\n"

@@ -388,7 +388,9 @@ class Shapes(ur.protocols.Callback):
 
 
 WITH_STATES = [
-    (name, states) if states == "estimator" or name == "rcv" else slow(name, states)
+    (name, states)
+    if name == "rcv" or (states == "estimator" and name in ("adaptive", "coupled", "meta", "momentum"))
+    else slow(name, states)
     for name in PAIRS
     for states in ("estimator", "carry", "reset")
 ]

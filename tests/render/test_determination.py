@@ -143,6 +143,7 @@ def test_elements_of_a_list_have_a_lower_limit_than_cells(size: float, count: in
     assert undetermined_cells({"wall": np.repeat(seen, 8).reshape(8, 48, 1)})
 
 
+@pytest.mark.slow
 def test_a_run_tells_in_its_folder(tmp_path: Any):
     material = {"type": "principled", "sheen": 0.0, "sheen_tint": 0.5}
     keys = "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value"

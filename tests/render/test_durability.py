@@ -92,6 +92,7 @@ def kill_everywhere(
     return len(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_flush")
 def test_a_run_killed_at_some_file_operations(tmp_path: Path, whole: dict[str, bytes]) -> None:
     assert kill_everywhere(tmp_path, whole, slice(0, None, 11)) > 100

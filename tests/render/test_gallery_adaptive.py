@@ -133,6 +133,7 @@ def test_truth_and_start_lie_inside_the_bounds_and_differ(small):
     assert all(error > 0.08 for error in errors.values()), errors
 
 
+@pytest.mark.slow
 def test_the_truth_renders_to_the_reference_and_the_start_does_not(small):
     for view, given in enumerate(small.views):
         reference = np.asarray(given.reference, float)

@@ -164,6 +164,7 @@ def test_a_state_of_separate_views_goes_on_with_them(monkeypatch: pytest.MonkeyP
     assert len(after.image.views) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_ends")
 def test_checkpoints_of_separate_and_joined_views_are_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As those of workers and of earlier versions are; with the same launches to the same bits."""

@@ -90,6 +90,7 @@ def test_auto_finds_a_far_rotation_beside_an_unknown_scale() -> None:
     assert 0.7 < start["lamp.scale"] < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", quick([None, 0.0], 0.0))
 def test_auto_leaves_a_start_at_which_the_sun_lights_other_faces(
     share: float | None, monkeypatch: pytest.MonkeyPatch

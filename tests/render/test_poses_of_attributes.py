@@ -56,6 +56,7 @@ def test_colours_move_with_the_mesh(name: str, tmp_path: Path) -> None:
     assert np.sqrt(np.mean((still - one) ** 2)) > 5 * noise
 
 
+@pytest.mark.slow
 def test_a_place_and_colours_of_vertices_are_recovered(tmp_path: Path) -> None:
     """Perturbed renders and path gradients evaluate the colours of the moved mesh. The reference is Mitsuba's."""
     file, key = _file(tmp_path, "vertex_color"), "quad.translation.x"

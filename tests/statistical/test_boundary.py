@@ -193,6 +193,7 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
     assert np.abs(scores(interior + 0.6 * (found - interior), expected)).max() > LIMIT
 
 
+@pytest.mark.slow
 def test_a_lamp_that_moves_and_planted_faults() -> None:
     """Its picture moves, and the light that it sends to surfaces. Without the second, or with nine tenths of both, the test fails."""
     lamp, key = shining(tilt=70.0), "moving.scale"

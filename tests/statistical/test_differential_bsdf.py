@@ -78,6 +78,7 @@ def plant_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
 CASES = [(name, alpha) for name in ("ggx", "beckmann") for alpha in (0.02, 0.1, 0.3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", quick(CASES, ("ggx", 0.1)))
 def test_the_gradient_is_unbiased_and_less_noisy(case: tuple[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     distribution, alpha = case

@@ -365,6 +365,7 @@ def test_textures_beside_a_served_one_are_looked_at() -> None:
         Lookups(renderer.pair, ["ball.bsdf.reflectance.color0.data"])
 
 
+@pytest.mark.slow
 def test_paths_are_those_of_the_same_parameters_in_any_order() -> None:
     """Sessions of other parameters number their lookups otherwise: they trace."""
     renderer = MitsubaRenderer(SCENES["textures"][0], zoo.DEPTH)

@@ -149,6 +149,7 @@ def test_gradients_of_each_sensor_alone(name: str) -> None:
     check_replay(renderer, SampleRequest(0, 256, 7), KEY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filter_name", quick(["box", "gaussian"], "gaussian"))
 def test_one_recording_serves_all_cameras(filter_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Images and gradients are those of a scene that has this camera only."""

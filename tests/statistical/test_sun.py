@@ -83,6 +83,7 @@ def test_the_sun_is_as_bright_as_in_mitsuba_and_its_edge_is_seen() -> None:
     assert not agree(0.998 * ours, theirs, size=8), "two parts in a thousand went unseen"
 
 
+@pytest.mark.slow
 def test_with_other_probabilities_of_the_emitters_it_is_as_bright() -> None:
     """A dark lamp that is seldom chosen, so that it adds little noise."""
     lamp = {"type": "point", "position": [0, 2, 0], "intensity": 0.0}
@@ -93,6 +94,7 @@ def test_with_other_probabilities_of_the_emitters_it_is_as_bright() -> None:
     assert not agree(0.998 * ours, theirs, size=8), "two parts in a thousand went unseen"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "space"),
     [slow(ALBEDO, "path"), slow(TURBIDITY, "primary"), (SUN, "primary"), slow(TURN, "primary")],

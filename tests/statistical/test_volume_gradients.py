@@ -128,8 +128,9 @@ def test_gradients_of_media_agree_with_finite_differences(name: str) -> None:
     assert max(map(abs, found.values())) < limit(len(found)), found
 
 
+@pytest.mark.slow
 def test_gradients_of_voxels_agree_with_finite_differences() -> None:
-    """The quick version of the above: single scattering."""
+    """Single scattering."""
     renderer = MitsubaRenderer(scene(voxels(), lights="sky"), 2)
     found = scores(renderer, own(renderer), 32)
     assert max(map(abs, found.values())) < limit(len(found)), found

@@ -63,10 +63,10 @@ def names_imported(source: str) -> list[tuple[str, int, bool]]:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         own = (name.removeprefix("unrender.") for name in names if name.startswith("unrender."))
         found.extend((name, getattr(node, "lineno", 0), now) for name in own)
-        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for_types = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         now = now and not for_types and not isinstance(node, ast.FunctionDef)
-        for child in ast.iter_child_nodes(node):
-            if not isinstance(child, ast.expr):  # an expression imports nothing
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):  # of statements: an expression imports nothing
+            for child in getattr(node, block, ()):
                 visit(child, now)
 
     visit(parsed(source), True)

@@ -224,6 +224,7 @@ def solver() -> ur.optimizers.Optimizer:
     return ur.optimizers.Partitioned(("pose",), ur.optimizers.AveragedNewton(), ur.optimizers.Adam(0.02))
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba  # a run folder asks for it
 def test_a_block_of_numbers_is_solved_beside_a_texture(tmp_path: Path) -> None:
     """In the steps that `wait` and `every` say; with the estimate of its estimator alone; and to the bit after a pause."""

@@ -35,6 +35,7 @@ def run(folder: Path, absent: tuple[str, ...]) -> subprocess.CompletedProcess[st
     return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_a_run_needs_nothing_of_the_application(tmp_path: Path) -> None:
     done = run(tmp_path, APPLICATION)
     assert done.returncode == 0, done.stderr

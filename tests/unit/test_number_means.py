@@ -65,6 +65,7 @@ def test_a_number_that_drifts_leaves_the_others_without_errors() -> None:
     assert errors["a"][0] == pytest.approx(0.1 / np.sqrt(190), rel=0.4)
 
 
+@pytest.mark.slow
 def test_numbers_beside_other_unknowns_have_means_without_errors() -> None:
     """A texture that still drifts takes numbers along slowly, so the scatter of their steps is no error."""
     made = problem()

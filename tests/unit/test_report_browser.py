@@ -62,6 +62,7 @@ def test_the_report_lets_one_choose_pictures_views_and_exposure(tmp_path):
         assert page.complaints == []
 
 
+@pytest.mark.slow
 def test_the_report_fits_a_phone(tmp_path):
     path = report.page(write_run(tmp_path / "run", command="unrender " + "very-long-" * 40))
     with chromium(viewport={"width": 360, "height": 740}) as page:

@@ -941,7 +941,8 @@ def test_a_difference_that_changes_its_sign_within_tiles_is_told(axis: int, samp
 
 
 @pytest.mark.parametrize(
-    ("side", "size", "count"), [(24, 0.05, 40), slow(48, 0.05, 40), slow(128, 0.2, 6), slow(256, 0.1, 3), (256, 0.2, 3)]
+    ("side", "size", "count"),
+    [(24, 0.05, 40), slow(48, 0.05, 40), slow(128, 0.2, 6), slow(256, 0.1, 3), slow(256, 0.2, 3)],
 )
 def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side: int, size: float, count: int) -> None:
     """The score of a correlation grows with the root of the number of pixels, so that one of 0.018 shows in large pictures."""
