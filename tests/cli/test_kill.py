@@ -148,51 +148,36 @@ def wait_for_steps(process: subprocess.Popen[str], folder: Path, steps: int) -> 
         time.sleep(0.005)
 
 
-def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
-    """Kill each command in the first and in the second half of its steps, in turn."""
-    dice = random.Random(seed)
-    names = list(COMMANDS)
-    died = number = 0
-    statuses: dict[str, int] = {}
-    while died < kills:
-        number += 1
-        assert number < 4 * kills + 20
-        name, half = names[number % len(names)], number // len(names) % 2
-        words = [
-            *COMMANDS[name],
-            "--steps",
-            COMMAND_STEPS,
-            "--threads",
-            1,
-            "--variant",
-            "llvm_ad_rgb",
-            "--final-spp",
-            1,
-        ]
-        whole, folder = tmp_path / f"{names.index(name)}-whole", tmp_path / f"{names.index(name)}-{number}"
-        if not whole.exists():
-            statuses[name] = finish(command("run", *words, "--out", whole, "--checkpoint-every", 7))
-            assert statuses[name] in ENDED
-        process = command("run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3)))
-        wait_for_steps(
-            process, folder, dice.randint(*((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS))[half])
-        )
-        time.sleep(dice.uniform(0, 0.05))
-        process.kill()
-        status = finish(process)
-        if status in ENDED:
-            assert status == statuses[name]
-            continue
-        check_readable(folder)
-        begun = (folder / "run.json").exists()
-        if begun and json.loads((folder / "run.json").read_text())["status"] in ("finished", WORSE, MEMORY_DISAGREES):
-            continue  # it died while it wrote its page, and is refused: there is nothing to go on with
-        died += 1
+def kill_command(tmp_path: Path, name: str, seed: int) -> None:
+    """Kill a command once in the first and once in the second half of its steps."""
+    dice, tried = random.Random(f"{name} {seed}"), 0
+    words = [*COMMANDS[name], "--steps", COMMAND_STEPS, "--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1]
+    whole = tmp_path / "whole"
+    status = finish(command("run", *words, "--out", whole, "--checkpoint-every", 7))
+    assert status in ENDED
+    for first, last in ((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS)):
+        while True:
+            tried += 1
+            assert tried < 10
+            folder = tmp_path / str(tried)
+            process = command("run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3)))
+            wait_for_steps(process, folder, dice.randint(first, last))
+            time.sleep(dice.uniform(0, 0.05))
+            process.kill()
+            ended = finish(process)
+            if ended in ENDED:
+                assert ended == status
+                continue
+            check_readable(folder)
+            begun = (folder / "run.json").exists()
+            done = ("finished", WORSE, MEMORY_DISAGREES)
+            if not (begun and json.loads((folder / "run.json").read_text())["status"] in done):
+                break  # else it died while it wrote its page, and is refused: there is nothing to go on with
         again = (
             ["resume", folder] if begun else ["run", *words, "--out", folder, "--overwrite", "--checkpoint-every", 5]
         )
-        assert finish(command(*again)) == statuses[name], (name, number)
-        assert states(folder) == states(whole), (name, number)
+        assert finish(command(*again)) == status, tried
+        assert states(folder) == states(whole), tried
 
 
 @pytest.mark.slow
@@ -201,5 +186,6 @@ def test_many_are_killed(killer: Killer, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_many_commands_are_killed(tmp_path: Path) -> None:
-    kill_commands(tmp_path, 2 * len(COMMANDS), seed=4)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_commands_are_killed(name: str, tmp_path: Path) -> None:
+    kill_command(tmp_path, name, seed=4)

@@ -65,7 +65,8 @@ def names_imported(source: str) -> list[tuple[str, int, bool]]:
         found.extend((name, getattr(node, "lineno", 0), now) for name in own)
         for_types = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         now = now and not for_types and not isinstance(node, ast.FunctionDef)
-        for block in ("body", "orelse", "finalbody", "handlers", "cases"):  # of statements: an expression imports nothing
+        # Only statements: an expression imports nothing.
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
             for child in getattr(node, block, ()):
                 visit(child, now)
 
