@@ -13,8 +13,6 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import numpy as np
-
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, printable
 
@@ -159,5 +157,7 @@ class DropReport:
 
 def refuse_masked(value: Any, advice: str) -> None:
     """Raise `InputError` with advice for a NumPy array of which some elements are masked: as an array they are values like others."""
+    import numpy as np  # a command that only says its version does without
+
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"a masked array has values that do not count: {advice}")
