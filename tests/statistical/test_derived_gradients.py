@@ -124,7 +124,7 @@ def test_the_gradient_of_displaced_lenses_is_the_slope_of_the_loss() -> None:
         return np.array(mi.render(scene, integrator=tracer, spp=2048, seed=mi.UInt32(seed)), np.float64)
 
     start = {"height": np.array([0.12, 0.12, 0.12])}
-    reference = picture({"height": np.array([0.2, 0.08, 0.14])}, 99)
+    reference = picture({"height": np.array([0.06, 0.08, 0.14])}, 99)  # from 0.2 the first slope is hidden by noise
     problem = lenses.problem("lenses").replaced(views=[ur.View(reference.astype(np.float32))])
     expected = np.stack([slopes(picture, start, reference, {"height": 0.005}, seed) for seed in range(6)])
     compare(problem, ur.GaussNewton(spp=2048, shift=0.02, derivative_spp=2048), 16, expected, tuple(start), fault=0.5)
