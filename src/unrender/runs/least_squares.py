@@ -147,7 +147,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
         directions, length = _directions(again, numbers.limits, change)
     check = _checked(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
-    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="") if fixed else check
+    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="", blind=()) if fixed else check
 
 
 def _of_tested_views(check: NumbersCheck, numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> NumbersCheck:
