@@ -831,3 +831,20 @@ def test_no_probe_is_made_that_ends_after_the_budget(late: bool) -> None:
     found = final_images.render_final_images(made, result, 8, left=lambda: -1.0, grace=1.0 if late else 3.0)
     assert bool(found.sensitivity) is not late
     assert any(TOO_SHORT in line for line in found.undetermined) is late
+
+
+@pytest.mark.parametrize("of_samples", [True, False])
+def test_a_difference_that_only_may_be_noise_of_the_references_takes_standard_errors_away(
+    of_samples: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A line said that light or depth may be wrong, and maps of standard errors stood beside it."""
+    still = Misfit(0.1, 1.0, 0.0, True, causes=(STEPS, NOISE), of_samples=of_samples)
+    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: None)
+    monkeypatch.setattr(final_images, "differs_still", lambda *_: still)
+    made = textured(0.0, 0.1)
+    values = {"map": np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)}  # type: ignore
+    result = Result(values, values, [{}] * 150, 1.0, 0.0, "steps")
+    result = replace(result, verification={"best": "end"}, standard_error={"map": np.full(32, 0.1)})
+    found = final_images.render_final_images(made, result, 16, tested=False)
+    assert found.misfit is still
+    assert bool(found.standard_error) is of_samples

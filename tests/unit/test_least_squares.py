@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import zlib
 from typing import Any
 
@@ -500,6 +501,37 @@ def test_a_distortion_that_explains_little_of_the_difference_has_no_name(brightn
     assert bool(found) == bool(words)
     brightness_is = next(iter(distortions(scenery, reference)))
     assert [brightness_is(np.array([by])) for by in (-254.0, 1.02)] == [f"were {x} times as bright" for x in (255, 0)]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("distort", "words"),
+    [
+        (lambda picture, x: picture, ""),
+        (
+            lambda picture, x: picture * (1.0 + 0.001 * x),
+            r"by 0\.\d+ % in a pattern that neither noise nor these numbers explain",
+        ),
+        (lambda picture, x: picture + 0.016 * (x > 0.0), "neither noise nor these numbers explain"),
+    ],
+)
+def test_smooth_differences_far_below_the_noise_of_a_pixel_take_standard_errors_away(
+    distort: Any, words: str, seed: int
+) -> None:
+    """A lamp that was known 3 % too dim, and gamma 2.2 for sRGB, left errors 10 to 80 times too small below 1 % of the picture."""
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    scenery, spot = _scenery(x, y), _seen(0.0, x, y) - _scenery(x, y)
+    renderer = AnalyticRenderer(
+        {"a": np.zeros(1)}, spot.reshape(-1, 1), offset=scenery, noise=0.0, grain=0.4, shape=(SIDE, SIDE)
+    )
+    random = np.random.default_rng(seed)
+    reference = distort(scenery + spot, x[..., None]) + random.normal(0.0, 0.02, scenery.shape)
+    made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [ur.View(reference.astype(np.float32))])
+    fitted = np.linalg.lstsq(spot.reshape(-1, 1), (reference - scenery).ravel(), rcond=None)[0]
+    ends = [scenery + fitted * spot + random.normal(0.0, 0.02, scenery.shape) for _ in range(2)]
+    found = check_numbers(made, {"a": fitted.astype(np.float32)}, made.initial_values(), FAR, ends=[ends])
+    assert bool(found.distorted) == bool(words) == ("a" not in found.errors)
+    assert re.search(words, found.distorted)
 
 
 def test_no_time_no_check():

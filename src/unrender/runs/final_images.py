@@ -38,7 +38,7 @@ from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pi
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.reference_distortions import AS_IF
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, NOISE, Misfit, misfit_of_views
+from unrender.runs.verification import DIFFERS, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -64,7 +64,6 @@ _PICTURES_SHARE, _MOST_CHECK = 0.5, 1.25
 this check may take; its most time, relative to that of the pictures, that is set aside by rendering fewer samples."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
-
 _NOT_TESTED = "the end of the run was not tested, or had no time left"  # for standard errors of textures and grids
 _SEEDS = {"initial": 1, "result": 2}
 _HALVES = 2 * len(_SEEDS)
@@ -153,11 +152,11 @@ def render_final_images(
         can_check = renderings_of_check(problem) / _HALVES * spent < _PICTURES_SHARE * left()
         differs = _differs(problem, result, chosen, halves_of, samples, can_check)
         still = None if differs else differs_still(problem, result, chosen, ends, samples)
-        fits = not differs and (still is None or NOISE in still.causes)
+        fits = not differs and (still is None or still.of_samples)
         if not tested and result.steps and not differs:
             lines, deviations = _left_out(problem, result)
         if everything:
-            end = _Tests(problem, result, weights, left, tests, spent / paths)
+            end = _Tests(problem, result, weights, left, tests, spent / paths, ends)
             lines, warnings, deviations, unseen = _undetermined(end, known, fits, complete)
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
@@ -228,7 +227,7 @@ def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.nda
 
 @dataclass(frozen=True)
 class _Tests:
-    """Run whose end is tested, `weights` and `left` of `render_final_images`, seconds for all tests, and time of a path."""
+    """Run whose end is tested, `weights` and `left` of `render_final_images`, seconds for all tests, time of a path, and final pictures."""
 
     problem: Problem
     result: Result
@@ -236,6 +235,7 @@ class _Tests:
     left: Callable[[], float]
     seconds: float
     path_seconds: float
+    ends: Sequence[Sequence[np.ndarray]]
 
     def within(self, seconds: float) -> float:
         """Return the seconds that a test may take: if renderings are counted, no more than are left."""
@@ -267,7 +267,7 @@ def _undetermined(
     if timing.counts():
         of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
     numbers = check_numbers(
-        problem, result.parameters, result.initial, of_numbers, sensitivities, tests.weights, stated
+        problem, result.parameters, result.initial, of_numbers, sensitivities, tests.weights, stated, tests.ends
     )
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)

@@ -19,7 +19,7 @@ from unrender.display import formatting
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
-from unrender.runs.reference_distortions import distortion_of_fit
+from unrender.runs.reference_distortions import distortion_of_fit, unexplained_share
 from unrender.runs.verification import compares
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -58,6 +58,7 @@ def check_numbers(
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
     weights: Sequence[np.ndarray] = (),
     known: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ends: Sequence[Sequence[np.ndarray]] = (),
 ) -> NumbersCheck:
     """Test the problem's numbers by least squares at `values`.
 
@@ -79,6 +80,7 @@ def check_numbers(
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
         weights: weights of each view's pixels in the run's steps (`Result`); () if equal. A fit with others has another solution.
         known: {key: standard errors} that the run states. Where they are small, noise of this check leaves no number undetermined.
+        ends: independent pictures of each view at the end, by whose mean the model is tested; () for no test.
     """
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
@@ -86,7 +88,7 @@ def check_numbers(
     if (affordable := numbers.affordable(_PASSES + 1, seconds if timing.counts() else math.inf)) is None:
         return NumbersCheck(unchecked=numbers.keys)
     stated = np.concatenate([np.ravel(known.get(k, np.full(values[k].size, math.inf))) for k in affordable.keys])
-    numbers = replace(affordable, weights=weights, settled=stated < _DOUBTFUL * affordable.sizes)
+    numbers = replace(affordable, weights=weights, ends=ends, settled=stated < _DOUBTFUL * affordable.sizes)
     try:
         return _of_tested_views(_check(numbers, sensitivities, timing.now() + seconds), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
@@ -214,7 +216,7 @@ class _Fit:
         better: standard errors by which the picture is better than with the start's numbers.
         beyond: distance of the solution beyond a bound of the number, (n,); 0 where noise may explain it.
         distortion: what a reference looks like, see `distortion_of_fit`; "" for nothing.
-        moves: change of the numbers if it were so, (n,).
+        moves, unexplained: change of the numbers if it were so, (n,); see `unexplained_share`.
     """
 
     covariance: np.ndarray
@@ -227,6 +229,7 @@ class _Fit:
     beyond: np.ndarray = field(default_factory=lambda: np.zeros(1))
     distortion: str = ""
     moves: np.ndarray | float = 0.0
+    unexplained: float = 0.0
 
     @classmethod
     def of(
@@ -278,10 +281,10 @@ class _Fit:
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
         seen = np.where(hidden[:, None, None], 0.0, slopes)
-        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, np.where(hidden, 0.0, inverse))
-        return cls(
-            total, error, own, step[:n], unseen[:, hidden], blind, better, beyond, distortion, changes[:n] @ moves
-        )
+        kept = np.where(hidden, 0.0, inverse)
+        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, kept)
+        told = distortion, changes[:n] @ moves, unexplained_share(numbers, seen, kept)
+        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better, beyond, *told)
 
 
 def _better(residuals: np.ndarray, before: np.ndarray) -> float:
@@ -355,19 +358,19 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
 
 
 def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, unsettled: bool) -> str:
-    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,); "" for none. Where numbers
-    are `unsettled`, their pictures may differ as if distorted."""
+    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,), or about a difference that
+    no numbers explain; "" for none. Where numbers are `unsettled`, their pictures may differ as if so."""
     moves = np.broadcast_to(fit.moves, of_step.shape)
-    moved = [
-        f"{key} by {_numbers(moves[of])}"
-        for key, of in numbers.places().items()
-        if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
-    ]
-    line = (
-        f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references {fit.distortion}, which would move "
-        f"{listed(moved)}; {'give more steps or another start, then ' * unsettled}check the references and the camera"
-    )
-    return line if moved else ""
+    far = {
+        key: moves[of] for key, of in numbers.places().items() if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
+    }
+    moved = [f"{key} by {_numbers(by)}" for key, by in far.items()]
+    line = f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references "
+    first = "give more steps or another start, then " * unsettled
+    if moved:
+        return f"{line}{fit.distortion}, which would move {listed(moved)}; {first}check the references and the camera"
+    line += f"by {100.0 * fit.unexplained:.2g} % in a pattern that neither noise nor these numbers explain; {first}check what is not among "
+    return f"{line}the unknowns, such as lights, the camera and the tone curve" if fit.unexplained else ""
 
 
 def _shared_with_fields(covariance: np.ndarray, n: int) -> np.ndarray:

@@ -88,6 +88,7 @@ class Numbers:
         fields: {key: (k, *shape)}, directions of textures and grids.
         weights: weights of each view's pixels in addition to the views' weights, (H, W, 1) or (H, W, 3); () for equal ones.
         settled: whether the run states a small standard error of a number, (n,).
+        ends: see `check_numbers`.
     """
 
     problem: Problem
@@ -103,6 +104,7 @@ class Numbers:
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
     weights: Sequence[np.ndarray] = ()
     settled: np.ndarray | bool = False
+    ends: Sequence[Sequence[np.ndarray]] = ()
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:

@@ -23,8 +23,7 @@ from unrender.statistics import paired_losses
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
 STEPS, STEPS_OF_FEW, PRIOR, NOISE = "steps", "steps of few", "prior", "noise"
-"""Values of `Misfit.causes` that may explain a difference although the scene is right: too few steps, surely or if the run had few; a prior
-that is too strong; noise of the references."""
+"""Values of `Misfit.causes` that may explain a difference of a right scene: too few steps, surely or if there were few; a prior; noise."""
 LOST = "lost"
 """Value of `Misfit.causes`: an unknown that the pictures show at the start, but no longer at the end."""
 OF_FUNCTION = "the loss is a function of your own, whose minimum may differ from the references"
@@ -41,7 +40,6 @@ one in few pixels."""
 _SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 """Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
-
 _ROWS, _PAIRS = (3, 1), (1, 0)  # layouts for `paired_losses.systematic` of rows of pixels, and of pairs of a sample
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
@@ -62,6 +60,7 @@ class Misfit:
         explanation: rest of the warning, after `describe`.
         causes: likely causes: `STEPS`, `STEPS_OF_FEW`, `PRIOR`, `NOISE`, `LOST`; () for something that is not among the unknowns.
         place: words about the pixels that hold it; "" for all.
+        of_samples: whether it looks like the noise of few samples per pixel, which standard errors contain.
     """
 
     error: float
@@ -71,6 +70,7 @@ class Misfit:
     explanation: str = ""
     causes: tuple[str, ...] = ()
     place: str = ""
+    of_samples: bool = False
 
     @property
     def share(self) -> float:
@@ -245,7 +245,7 @@ def as_few_samples(
     if pattern := paired_losses.has_pattern(one, other, weights, sizes):
         words = "in a pattern that noise lacks:"
     words += " the run needs more steps or another start, or light, depth, alignment or something that is not among the unknowns is wrong"
-    return Misfit(error, size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE))
+    return Misfit(error, size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE), of_samples=not pattern)
 
 
 def misfit_of_views(

@@ -21,6 +21,8 @@ rate of its test."""
 _BESIDE, _ALONG, _LEAST_SIDE = 4, 2.0, 12
 """Number of lines of pixels, from the third on, to which a picture's outermost line is compared; score of the products along it from which
 its pixels agree; fewest pixels of a side."""
+_SIDE, _FEWEST, _ROUNDING = 3, 16, 2.0
+"""Blocks of `in_blocks` along each axis, fewest pixels of one, and standard errors of a mean that does not count."""
 _OFFSETS, _PATTERN = ((0, DISTANCE), (DISTANCE, 0), (DISTANCE, DISTANCE), (DISTANCE, -DISTANCE)), 0.25
 """Rows and columns between the pixels of `has_pattern`, and the smallest correlation that counts."""
 
@@ -275,6 +277,46 @@ def systematic(
         return SystematicDifference(square, math.inf if square > 0 else 0.0)
     total = float(products.sum())
     return SystematicDifference(square, min(total / sharp, _ROBUST * total / robust))
+
+
+def in_blocks(
+    values: np.ndarray, counted: np.ndarray, sizes: Sequence[tuple[int, int]], least: float
+) -> SystematicDifference:
+    """Return the part of differences that the pixels of a block share, for nine blocks of each image: smooth differences far below a
+    pixel's noise.
+
+    The mean of a block is divided by its standard error from the scatter of its pixels, which correlations of adjacent ones increase. The
+    sum of the squares has the χ²-distribution if all is noise; the score is its normal deviate (Wilson and Hilferty 1931).
+
+    Args:
+        values: differences, (N, C), with noise that is independent of pixels further apart than adjacent ones.
+        counted: pixels that count, (N,).
+        sizes: (height, width) of the images.
+        least: mean of a block that does not count, since rounding is no noise: above 0.
+    """
+    squares, means, variances, along, total = [], [], [], np.zeros(2), 0.0
+    for part, size in zip(slices_of_images(sizes), sizes, strict=True):
+        image, used = values[part].reshape(*size, -1), counted[part].reshape(size)
+        rows, columns = (np.linspace(0, side, _SIDE + 1).astype(int) for side in size)
+        for row, column in np.ndindex(_SIDE, _SIDE):
+            place = slice(rows[row], rows[row + 1]), slice(columns[column], columns[column + 1])
+            here, count = used[place], np.count_nonzero(used[place])
+            if count < _FEWEST:
+                continue
+            mean = image[place][here].mean(axis=0)
+            rest = np.where(here[..., None], image[place] - mean, 0.0)
+            variance = np.square(rest).sum(axis=(0, 1)) / (count * (count - 1))
+            total += float(np.square(rest).sum())
+            along += [float((rest[1:] * rest[:-1]).sum()), float((rest[:, 1:] * rest[:, :-1]).sum())]
+            squares.append(float(np.mean(np.square(mean) / np.maximum(variance, (least / _ROUNDING) ** 2))))
+            means.append(float(np.mean(np.square(mean))))
+            variances.append(float(np.mean(variance)))
+    if not squares:
+        return SystematicDifference(0.0, 0.0)
+    wider = float(np.prod(1.0 + 2.0 * np.maximum(along / max(total, 1e-300), 0.0)))
+    spread, ratio = 2.0 / (9.0 * len(squares)), float(np.mean(squares)) / wider
+    score = (ratio ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
+    return SystematicDifference(float(np.mean(means) - wider * np.mean(variances)), score)
 
 
 def nearby(
