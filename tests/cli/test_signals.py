@@ -118,7 +118,7 @@ def test_an_error_of_its_own_is_no_interrupt(unrender, monkeypatch, mitsuba_vari
 
 def test_outside_of_runs_both_interrupt(unrender, monkeypatch: pytest.MonkeyPatch) -> None:
     for number, status, words in ((signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")):
-        monkeypatch.setattr(command, "_command", lambda given, number=number: partial(send, number))
+        monkeypatch.setattr(command, "_command", lambda given, began, number=number: partial(send, number))
         answer = unrender("methods")
         assert (answer.status, answer.error) == (status, f"unrender: {words}\n")
 

@@ -124,6 +124,19 @@ def test_a_pause_holds_the_step_and_is_no_time_of_the_run(problem, tmp_path):
     assert not (tmp_path / "control.json").exists()
 
 
+def test_a_command_that_is_read_while_it_is_written_counts_afterwards(problem, tmp_path):
+    """The file was empty when it was read, and its time was the same after it was filled: a pause lasted for ever."""
+    path, stamp = tmp_path / "control.json", (10**18, 10**18)
+
+    def write(text: str) -> None:
+        path.write_text(text)
+        os.utime(path, ns=stamp)
+
+    steps = Then(_2=lambda: write(""), _4=lambda: write('{"command": "stop"}'))
+    result = descend(problem, [steps, Live(tmp_path)])
+    assert (result.stopped, result.steps) == ("interrupted", 4)
+
+
 def test_stop_ends_the_run_as_an_interrupt_does(problem, tmp_path):
     result = descend(problem, [Then(_3=lambda: order(tmp_path, "stop")), Live(tmp_path)])
     assert (result.stopped, result.steps) == ("interrupted", 3)

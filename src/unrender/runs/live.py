@@ -71,7 +71,7 @@ class Live(Callback):
         self._next_poll = self._next_update = 0.0
         self._cost = 0.0
         self._initial_error: dict[str, float] = {}
-        self._command: tuple[tuple[int, int], str] = ((0, 0), "run")
+        self._command: tuple[tuple[int, int, int], str] = ((0, 0, 0), "run")
 
     def on_start(self, run: Run) -> None:
         try:
@@ -139,7 +139,8 @@ class Live(Callback):
         path = self._folder / CONTROL
         try:
             status = os.stat(path, follow_symlinks=False)
-            stamp = status.st_mtime_ns, status.st_ino
+            # A writer that empties the file first may do both within the same tick of the clock.
+            stamp = status.st_mtime_ns, status.st_ino, status.st_size
             if stamp != self._command[0]:
                 self._command = stamp, self._command[1]
                 if 0 < status.st_size <= _LARGEST_CONTROL and path.is_file() and not path.is_symlink():
@@ -148,7 +149,7 @@ class Live(Callback):
                     if command in COMMANDS:
                         self._command = stamp, command
         except FileNotFoundError:
-            self._command = (0, 0), "run"
+            self._command = (0, 0, 0), "run"
         except (OSError, ValueError, RecursionError):
             pass
         return self._command[1]
