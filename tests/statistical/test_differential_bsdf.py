@@ -16,7 +16,7 @@ from zoo import DEPTH, SIZE, scene
 from zscores import z_scores
 
 import unrender as ur
-from tiers import quick
+from tiers import slow
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.methods.base import method
@@ -45,14 +45,14 @@ def key_of(renderer: MitsubaRenderer, role: str = "alpha") -> str:
 
 
 def gradients(
-    renderer: Renderer, parameters: dict[str, Any], runs: int = RUNS, seed: int = 0, size: int = SIZE
+    renderer: Renderer, parameters: dict[str, Any], runs: int = RUNS, seed: int = 0, size: int = SIZE, spp: int = SPP
 ) -> dict[str, np.ndarray]:
     """(runs, n) of Σ weight · image, by independent samples, for each key."""
     session = renderer.prepare(list(parameters), None)
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1.5, (1, size, size, 3)))
     found: dict[str, list[np.ndarray]] = {key: [] for key in parameters}
     for run in range(runs):
-        paths = session.image(parameters, SampleRequest(0, SPP, Key(seed, run).uint32())).paths
+        paths = session.image(parameters, SampleRequest(0, spp, Key(seed, run).uint32())).paths
         for key, gradient in session.adjoint(parameters, paths, weight).items():
             found[key].append(np.array(gradient, np.float64).ravel())
     return {key: np.array(rows) for key, rows in found.items()}
@@ -78,14 +78,17 @@ def plant_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
 CASES = [(name, alpha) for name in ("ggx", "beckmann") for alpha in (0.02, 0.1, 0.3)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", quick(CASES, ("ggx", 0.1)))
+@pytest.mark.parametrize("case", [(), *map(slow, CASES)], ids=str)
 def test_the_gradient_is_unbiased_and_less_noisy(case: tuple[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    distribution, alpha = case
-    renderer = MitsubaRenderer(scene(metal(alpha, distribution)), DEPTH)
+    """In the quick tier, of fewer bounces and pixels."""
+    depth, runs, size, spp = (DEPTH, RUNS, SIZE, SPP) if case else (2, 16, 12, 64)
+    distribution, alpha = case or CASES[1]
+    description = scene(metal(alpha, distribution))
+    description["sensor"]["film"] |= {"width": size, "height": size}
+    renderer = MitsubaRenderer(description, depth)
     values = renderer.values([key_of(renderer)])
     (ordinary,), (ours,) = (
-        list(gradients(of, values, seed=seed).values())
+        list(gradients(of, values, runs, seed, size, spp).values())
         for seed, of in enumerate((renderer, with_differential_bsdf(renderer)))
     )
     z, limit = worst(ordinary, ours)
@@ -93,8 +96,8 @@ def test_the_gradient_is_unbiased_and_less_noisy(case: tuple[str, float], monkey
     assert np.var(ours) < 0.5 * np.var(ordinary)
 
     plant_a_fault(monkeypatch)
-    renderer = MitsubaRenderer(scene(metal(alpha, distribution)), DEPTH)
-    (wrong,) = gradients(with_differential_bsdf(renderer), values, seed=2).values()
+    renderer = MitsubaRenderer(description, depth)
+    (wrong,) = gradients(with_differential_bsdf(renderer), values, runs, 2, size, spp).values()
     assert worst(ours, wrong)[0] > limit
 
 

@@ -23,6 +23,20 @@ def runs(images: tuple[Any, ...]) -> np.ndarray:
     return np.stack([np.array(image) for image in images]).astype(np.float64)
 
 
+def test_an_image_of_the_pair_agrees_with_mitsuba_path_and_three_percent_are_seen() -> None:
+    """The quick twin of the test below."""
+    count = 8
+    description, changes = subject("blend")
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, previous = two_states(renderer, changes)
+    session = renderer.prepare(list(current), "path")
+    ours = runs(session.image_pair(current, previous, SampleRequest(0, count * SPP, 1, count), "path").images)
+    path, stock = mi.load_dict({"type": "path", "max_depth": DEPTH}), mi.load_dict(subject("blend")[0])
+    theirs = runs(tuple(mi.render(stock, integrator=path, spp=SPP, seed=100 + run) for run in range(count)))
+    assert agree(ours, theirs)
+    assert not agree(1.03 * ours, theirs)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TOGETHER)
 def test_both_images_of_the_pair_agree_with_separate_renders_and_those_with_mitsuba_path(name: str) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from fog import DARK, DEPTH, KIND, LEVELS, SIZE, cloud, fog, media_keys, scene, two_media, voxels
 from scipy import stats
+from zscores import z_scores
 
 from unrender.rendering.mitsuba.integrators import differential_tracking
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -126,6 +127,31 @@ def test_gradients_of_media_agree_with_finite_differences(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     found = scores(renderer, own(renderer), 60)
     assert max(map(abs, found.values())) < limit(len(found)), found
+
+
+def test_the_gradient_of_black_voxels_is_the_slope_of_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The quick twin of the tests below. Single scattering is linear in the albedo, so a long step has no bias."""
+    renderer, runs = MitsubaRenderer(scene(voxels(), lights="sky"), 2), 6
+    (key,) = (key for key in media_keys(renderer) if key.endswith("albedo.data"))
+    current = renderer.values([key])
+    (way,) = (way for way in directions(key, np.array(current[key])) if way.name == "dense, black")
+    raised = {key: renderer.array(np.array(current[key]) + 0.5 * way.along)}
+    session, slopes = renderer.prepare([key], "path"), []
+    for seed in range(runs):
+        pair = session.image_pair(raised, current, SampleRequest(0, 4 * SPP, 5000 + seed), "path")
+        change = np.array(pair.images).astype(np.float64) - np.array(pair.previous)
+        slopes.append([(change * WEIGHT).sum() / 0.5])
+
+    def score(renderer: MitsubaRenderer) -> float:
+        gradients = own(renderer)
+        found = [[np.sum(np.array(gradients(seed)[key], np.float64) * way.along)] for seed in range(runs)]
+        return abs(float(z_scores(np.array(found), np.array(slopes))[0]))
+
+    assert score(renderer) < limit(1)
+    monkeypatch.setattr(differential_tracking, "mis_density", lambda segment, t: segment.near * 0)
+    assert score(MitsubaRenderer(scene(voxels(), lights="sky"), 2)) > limit(
+        1
+    )  # collisions alone find no derivative where nothing scatters
 
 
 @pytest.mark.slow
