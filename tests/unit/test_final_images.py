@@ -848,3 +848,34 @@ def test_a_difference_that_only_may_be_noise_of_the_references_takes_standard_er
     found = final_images.render_final_images(made, result, 16, tested=False)
     assert found.misfit is still
     assert bool(found.standard_error) is of_samples
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_pictures_in_other_units_are_judged_as_those_of_colours(held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depths of hundreds beside colours: changes of the pictures had their own units, and residuals those of colours."""
+    made, truth = half_textured(), np.random.default_rng(0).uniform(0.1, 0.9, 50)
+    renderer, start = made.renderer, 0.45 if held else 0.5
+    assert isinstance(renderer, AnalyticRenderer)
+    exact, first = renderer.exact({"map": truth}), made.initial_values()
+    values = {"map": (start + 0.7 * (truth - start)).astype(np.float32)}
+    noise = 0.01 * np.random.default_rng(1).standard_normal((2, 2, *exact.shape))  # of halves and views
+    unknown = Parameter("map", initial=0.5, bounds=(0, 1), prior=Prior(near=0.45, std=0.2) if held else None)
+    known = Misfit(0.5 * float(np.sqrt(np.square(renderer.exact(values) - exact).mean())), 1.0, 0.0, causes=(PRIOR,))
+    found: list[Any] = []
+    for scale in (1.0, 500.0):
+        units = np.array([1.0, scale])
+        monkeypatch.setattr(Problem, "units", [1.0, 1.0 / scale])
+        views = [View(((1.0 if held else 0.8) * unit * exact).astype(np.float32)) for unit in units]
+        of = Problem(renderer, [unknown], views)
+
+        def picture(values: Any, view: int, half: int = 0, units: np.ndarray = units) -> np.ndarray:
+            return units[view] * (renderer.exact(values) + noise[half, view])
+
+        starts, ends = ([[picture(x, view, half) for half in (0, 1)] for view in (0, 1)] for x in (first, values))
+        if held:
+            found.append(final_checks.beyond_priors(of, known, values, ends, picture).causes)
+        else:
+            differs = final_checks.unexplained_pixels(of, values, starts, ends, picture)
+            found.append(differs and (round(differs.error, 4), differs.explanation))
+    assert found[0]
+    assert found[0] == found[1]

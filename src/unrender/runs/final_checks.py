@@ -221,7 +221,7 @@ def unexplained_pixels(
     residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
 
     def change(values: Mapping[str, np.ndarray]) -> np.ndarray:
-        return _joined([picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])
+        return _joined(problem, [picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])
 
     signs = np.random.default_rng(_SEED)
     random = change({key: changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()})
@@ -231,7 +231,8 @@ def unexplained_pixels(
     little &= (_around(little, sizes) >= _OF_AROUND) | ~random.any(axis=1)
     if np.count_nonzero(little * weights) < _FEWEST:
         return None
-    explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
+    moved = [np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)]
+    explained = [_joined(problem, moved)]
     explained += [change({**result, key: changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
     explained += map(change, _pulled(problem, result))
     rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
@@ -295,7 +296,7 @@ def beyond_priors(
     views = range(len(ends))
     residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
     explained = [
-        _joined([picture(moved, view) - of[0] for view, of in zip(views, ends, strict=True)])
+        _joined(problem, [picture(moved, view) - of[0] for view, of in zip(views, ends, strict=True)])
         for moved in _pulled(problem, values)
     ]
     rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
@@ -355,8 +356,10 @@ def _as_if(
     return cause, shared, sure
 
 
-def _joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.reshape(picture, (-1, 3)) for picture in pictures]).astype(np.float64)
+def _joined(problem: Problem, pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the pixels (N, 3) of pictures of all views, in the units of `residuals_of_views`."""
+    pairs = zip(pictures, problem.units, strict=True)
+    return np.concatenate([np.reshape(picture, (-1, 3)) * unit for picture, unit in pairs]).astype(np.float64)
 
 
 def _is_little(image: np.ndarray, change: np.ndarray, weights: np.ndarray) -> np.ndarray:
