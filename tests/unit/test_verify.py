@@ -240,6 +240,19 @@ def test_independent_noise_has_no_systematic_part(name: str) -> None:
     assert abs(np.mean(squares)) < 5 * np.std(squares) / np.sqrt(len(squares))
 
 
+@pytest.mark.parametrize("rare", [0.3, 1.0, 3.0])
+def test_rare_bright_samples_are_no_smooth_difference(rare: float) -> None:
+    """Blocks of pixels that all of them miss are too dark and have little scatter: every second picture was reported."""
+    generator, size, light = np.random.default_rng(6), (36, 36), 0.05
+    chance = rare / 144  # of a pixel to have one, with `rare` of them in a block
+    scores = []
+    for _ in range(30):
+        bright = light * (generator.poisson(chance, (4, *size, 1)) / chance - 1.0)
+        values = (bright + generator.normal(0.0, 0.05, (4, *size, 3))).reshape(-1, 3)
+        scores.append(paired_losses.in_blocks(values, np.ones(len(values), bool), [size] * 4, 5e-4).score)
+    assert np.count_nonzero(np.array(scores) > paired_losses.SIGNIFICANT) <= 1
+
+
 def test_a_shared_part_is_measured() -> None:
     generator = np.random.default_rng(5)
     found = [paired_losses.systematic(0.7 + generator.normal(size=(256, 3))) for _ in range(300)]

@@ -286,7 +286,8 @@ def in_blocks(
     pixel's noise.
 
     The mean of a block is divided by its standard error from the scatter of its pixels, which correlations of adjacent ones increase. The
-    sum of the squares has the χ²-distribution if all is noise; the score is its normal deviate (Wilson and Hilferty 1931).
+    sum of the squares has the χ²-distribution if all is noise; the score is its normal deviate (Wilson and Hilferty 1931). Blocks that rare
+    bright samples miss have too little scatter, so the squares of all means must exceed those of all standard errors as clearly.
 
     Args:
         values: differences, (N, C), with noise that is independent of pixels further apart than adjacent ones.
@@ -314,7 +315,8 @@ def in_blocks(
     if not squares:
         return SystematicDifference(0.0, 0.0)
     wider = float(np.prod(1.0 + 2.0 * np.maximum(along / max(total, 1e-300), 0.0)))
-    spread, ratio = 2.0 / (9.0 * len(squares)), float(np.mean(squares)) / wider
+    together = sum(means) / max(sum(variances), len(variances) * (least / _ROUNDING) ** 2)
+    spread, ratio = 2.0 / (9.0 * len(squares)), min(float(np.mean(squares)), together) / wider
     score = (ratio ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
     return SystematicDifference(float(np.mean(means) - wider * np.mean(variances)), score)
 
