@@ -529,9 +529,12 @@ def test_smooth_differences_far_below_the_noise_of_a_pixel_take_standard_errors_
     made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [ur.View(reference.astype(np.float32))])
     fitted = np.linalg.lstsq(spot.reshape(-1, 1), (reference - scenery).ravel(), rcond=None)[0]
     ends = [scenery + fitted * spot + random.normal(0.0, 0.02, scenery.shape) for _ in range(2)]
-    found = check_numbers(made, {"a": fitted.astype(np.float32)}, made.initial_values(), FAR, ends=[ends])
+    found = check_numbers(made, {"a": fitted.astype(np.float32)}, made.initial_values(), FAR, ends={0: ends})
     assert bool(found.distorted) == bool(words) == ("a" not in found.errors)
     assert re.search(words, found.distorted)
+    stated = ur.runs.uncertainty(made, {"a": fitted.astype(np.float32)}, seed=seed)
+    assert bool(words) == ("a" not in stated.standard_error)
+    assert re.search(words, " ".join(stated.missing))
 
 
 def test_no_time_no_check():

@@ -266,9 +266,8 @@ def _undetermined(
     of_numbers = allowed
     if timing.counts():
         of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
-    numbers = check_numbers(
-        problem, result.parameters, result.initial, of_numbers, sensitivities, tests.weights, stated, tests.ends
-    )
+    given = of_numbers, sensitivities, tests.weights, stated, dict(enumerate(tests.ends))
+    numbers = check_numbers(problem, result.parameters, result.initial, *given)
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     limits = within(seconds), per_pass, within(most), sensitivities, deviations, tests.path_seconds

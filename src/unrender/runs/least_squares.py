@@ -58,7 +58,7 @@ def check_numbers(
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
     weights: Sequence[np.ndarray] = (),
     known: Mapping[str, np.ndarray] = MappingProxyType({}),
-    ends: Sequence[Sequence[np.ndarray]] = (),
+    ends: Mapping[int, Sequence[np.ndarray]] = MappingProxyType({}),
 ) -> NumbersCheck:
     """Test the problem's numbers by least squares at `values`.
 
@@ -80,7 +80,7 @@ def check_numbers(
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
         weights: weights of each view's pixels in the run's steps (`Result`); () if equal. A fit with others has another solution.
         known: {key: standard errors} that the run states. Where they are small, noise of this check leaves no number undetermined.
-        ends: independent pictures of each view at the end, by whose mean the model is tested; () for no test.
+        ends: {view: independent pictures at the end}, by whose mean the model is tested; {} for no test.
     """
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):

@@ -82,9 +82,9 @@ def uncertainty(
 
     Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
     against them. Their standard errors contain the references' noise, and the distance from the least-squares solution, for a `Result` that
-    with `Result.pixel_weights`. Numbers have none if another unknown is a mesh, has a prior, or is a texture that is too large or has no
-    path gradient, nor if time runs out. `missing` contains the reason for each unknown without errors. No unknown has any if the problem
-    has few numbers and its pictures differ from the references by more than noise, in up to four views.
+    with `Result.pixel_weights`. Numbers have none beside a mesh, a prior, or a texture that is too large or has no path gradient, nor if
+    time runs out or a smooth difference remains that they do not explain. `missing` has the reasons. No unknown has any if few numbers are
+    unknown and the pictures differ from the references by more than noise, in up to four views.
 
     For textures, r is the pictures' residual, J their derivative with respect to the parameters, and H a diagonal element of the
     Gauss-Newton matrix JᵀJ. Elements are independent, and their values are not shrunk towards the start:
@@ -99,10 +99,9 @@ def uncertainty(
     (1 − f²) / 16, the means of 4 × 4 texels count as followed. The variance Σ of a pixel is that of the residual that neighbouring
     pixels do not share. τ² is the mean square change from the start plus the mean variance, and p the curvature of the parameter's prior.
 
-    Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
-    and a diagonal does not bound their errors; nor have textures with κ ≥ 1.5, such as those with more texels than pixels that see them,
-    and textures of which the picture is no linear function, such as of a roughness, a normal map or a weight.
-    There is none either if time or samples are too few.
+    Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels, and
+    a diagonal does not bound their errors. Nor have textures with κ ≥ 1.5, such as those with more texels than pixels that see them,
+    textures of which the picture is no linear function, such as a roughness, or any if time or samples are too few.
 
     Args:
         problem: problem with views and scene.
@@ -118,20 +117,21 @@ def uncertainty(
     """
     values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
     check_arguments("uncertainty", problem, values or {}, seconds, seed)
-    known, maps, until = Curvature(), Uncertainty(), timing.now() + seconds
+    known, maps, ends, until = Curvature(), Uncertainty(), {}, timing.now() + seconds
     keys, mapped = checked_keys(problem, values, problem.initial_values()), map_keys(problem)
     if mapped or keys:
         views = range(len(problem.views)) if mapped else selected_views(problem)
         halves = _halves(problem, values, views, seed)
-        if differs := misfit_of_views(problem, views, list(zip(*halves, strict=True))):
+        ends = dict(zip(views, zip(*halves, strict=True), strict=True))
+        if differs := misfit_of_views(problem, views, [*ends.values()]):
             return Uncertainty(missing=(differs.line,))
         if mapped or len(views) < len(problem.views):
             noise = pixel_noise(problem, halves) if mapped else ()
             known = curvature(problem, values, seconds=seconds, seed=seed, noise=noise)
         if mapped:
             maps = of_residuals(problem, values, halves, known, seed)
-    left = until - timing.now()
-    numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity(), weights)
+    limits = until - timing.now(), known.sensitivity(), weights, {}, ends
+    numbers = check_numbers(problem, values, problem.initial_values(), *limits)
     errors = {**numbers.standard_errors(values), **maps.standard_error}
     others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.elsewhere, *numbers.fixed})
     return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others), maps.limited)

@@ -104,7 +104,7 @@ class Numbers:
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
     weights: Sequence[np.ndarray] = ()
     settled: np.ndarray | bool = False
-    ends: Sequence[Sequence[np.ndarray]] = ()
+    ends: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
