@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from conftest import Unrender
+from tiers import slow
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes")
 
@@ -49,16 +50,24 @@ def test_an_out_folder_that_is_not_utf_8_is_refused_before_the_work(locale: str,
     assert not os.path.exists(os.fsencode(tmp_path) + b"/caf\xe9")
 
 
-@pytest.mark.slow
-def test_a_working_folder_that_is_not_utf_8_is_refused_before_the_work(problem: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("apart", [False, slow(True)], ids=["this process", "its own"])
+def test_a_working_folder_that_is_not_utf_8_is_refused_before_the_work(
+    apart: bool, problem: Path, unrender: Unrender, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The problem's own path goes into run.json, too."""
     folder = os.fsencode(tmp_path) + b"/caf\xe9"
     os.mkdir(folder)
     for name in ("wall.xml", "photo.exr", "problem.toml"):
         os.rename(tmp_path / name, os.path.join(folder, name.encode()))
-    command = [sys.executable, "-m", "unrender", "run", "problem.toml", "--steps", "1", "--out", str(tmp_path / "out")]
-    found = subprocess.run(command, cwd=folder, capture_output=True, check=False)
-    assert found.returncode == 2, found.stderr
-    assert b"not UTF-8" in found.stderr
-    assert found.stderr.count(b"\n") == 1
+    words = ["run", "problem.toml", "--steps", "1", "--out", str(tmp_path / "out")]
+    if apart:
+        found = subprocess.run([sys.executable, "-m", "unrender", *words], cwd=folder, capture_output=True, check=False)
+        status, error = found.returncode, found.stderr.decode()
+    else:
+        monkeypatch.chdir(os.fsdecode(folder))
+        answer = unrender(*words)
+        status, error = answer.status, answer.error
+    assert status == 2, error
+    assert "not UTF-8" in error
+    assert error.count("\n") == 1
     assert not (tmp_path / "out" / "run.json").exists()

@@ -6,7 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from unrender.io import images
 
 SCRIPT = """
 import sys
@@ -32,6 +35,16 @@ ur.optimize(problem, ur.PathGradient(), ur.optimizers.Adam(), steps=2)
 import drjit as dr
 assert dr.thread_count() == 1
 """
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_picture_borrows_a_thread_and_returns_it(tmp_path: Path) -> None:
+    import drjit as dr
+
+    sky = np.random.default_rng(1).uniform(0.1, 1.0, (256, 512, 3))
+    images.write(sky, tmp_path / "sky.exr")
+    assert np.allclose(images.read(tmp_path / "sky.exr").values, sky, atol=1e-2)
+    assert dr.thread_count() == 1
 
 
 @pytest.mark.slow

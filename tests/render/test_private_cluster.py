@@ -133,7 +133,6 @@ def cluster(home: Path) -> Iterator[dict[str, Any]]:
         }
 
 
-@pytest.mark.slow
 def test_it_listens_on_the_loopback_alone(cluster: dict[str, Any]) -> None:
     assert len(cluster["ports"]) >= 5, cluster["ports"]
     assert {address[-8:] for address in cluster["ports"].values()} == {"0100007F"}  # 127.0.0.1, also within IPv6

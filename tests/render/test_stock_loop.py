@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tiers import slow
 from benchmarks import stock_loop
 from benchmarks.internals import dr, mi
 from benchmarks.stock_loop import StockViews, priors
@@ -41,32 +42,34 @@ def by_hand(made: ur.Problem, with_priors: bool = True, repeats: int = REPEATS) 
     return np.array(rows)
 
 
-def by_library(made: ur.Problem) -> np.ndarray:
-    """Gradients of `PathGradient`, (REPEATS, 7)."""
+def by_library(made: ur.Problem, repeats: int = REPEATS) -> np.ndarray:
+    """Gradients of `PathGradient`, (repeats, 7)."""
     estimator, at, rows = ur.PathGradient(spp=SPP), made.initial(), []
     state = estimator.init(made, at)
-    for seed in range(REPEATS):
+    for seed in range(repeats):
         estimate, _ = estimator.estimate(made, at, state, Key(seed))
         gradient = penalized(estimate, made, at).gradient
         rows.append(trees.ravel({key: gradient[key] for key in at}))
     return np.array(rows)
 
 
-@pytest.mark.slow
-def test_the_gradient_of_the_loop_is_that_of_path_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Expressions, a world and a prior, each left out in turn as a planted fault."""
-    monkeypatch.setattr(features, "_SIDE", 12)
+@pytest.mark.parametrize("small", [True, slow(False)])
+def test_the_gradient_of_the_loop_is_that_of_path_gradients(small: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expressions, a world and a prior, each left out in turn as a planted fault; in the quick tier, the prior."""
+    monkeypatch.setattr(features, "_SIDE", 6 if small else 12)
     monkeypatch.setattr(features, "_TEXELS", 2)
-    worlds = ({}, {features.FAR: [0.0] * 3})
-    made = problem(TEXTS, worlds)
-    expected = by_library(made)
+    worlds = ({},) if small else ({}, {features.FAR: [0.0] * 3})
+    made, repeats = problem(TEXTS, worlds), 4 if small else REPEATS
+    expected = by_library(made, repeats)
 
     def agrees(found: np.ndarray) -> bool:
         _, p = stats.ttest_ind(found, expected, equal_var=False)
         return bool((np.asarray(p) > 1e-3 / expected.shape[1]).all())
 
-    assert agrees(by_hand(made))
-    assert not agrees(by_hand(made, with_priors=False, repeats=3))
+    assert agrees(by_hand(made, repeats=repeats))
+    assert not agrees(by_hand(made, with_priors=False, repeats=2 if small else 3))
+    if small:
+        return
     same = [ur.View(view.reference) for view in made.original_views]
     assert not agrees(by_hand(made.replaced(views=same), repeats=3))
     other = {**TEXTS, features.RIGHT: "0.6 * pattern"}

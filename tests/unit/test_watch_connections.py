@@ -109,7 +109,6 @@ def test_idle_and_busy_strangers_do_not_keep_the_owner_out(tmp_path: Path) -> No
     assert found["answered"] > 1
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("limits")
 def test_who_does_not_ask_or_asks_too_slowly_is_cut_off(tmp_path: Path) -> None:
     """Nothing, half a request, one byte after the other, a body that does not come, another request that does not end."""

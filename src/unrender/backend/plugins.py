@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 
 _FOLDER = "plugins"
@@ -53,7 +54,11 @@ def prefer_own() -> None:
 
 @contextmanager
 def only(folder: Path) -> Iterator[None]:
-    """Restrict Mitsuba's file resolver to one folder within this context. Other relative names resolve against the current directory."""
+    """Restrict Mitsuba's file resolver to one folder within this context. Other relative names resolve against the current directory.
+
+    Raises `InputError` for a name that is not UTF-8.
+    """
+    encode_text(str(folder), "folder of the scene")
     mi = _mitsuba()
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
