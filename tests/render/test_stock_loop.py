@@ -9,11 +9,11 @@ import pytest
 from scipy import stats
 
 import unrender as ur
-from tiers import slow
 from benchmarks import stock_loop
 from benchmarks.internals import dr, mi
 from benchmarks.stock_loop import StockViews, priors
 from benchmarks.suite.features import run as features
+from tiers import slow
 from unrender.core import trees
 from unrender.core.random import Key
 from unrender.estimators.penalties import penalized

@@ -149,9 +149,8 @@ def test_the_gradient_of_black_voxels_is_the_slope_of_the_image(monkeypatch: pyt
 
     assert score(renderer) < limit(1)
     monkeypatch.setattr(differential_tracking, "mis_density", lambda segment, t: segment.near * 0)
-    assert score(MitsubaRenderer(scene(voxels(), lights="sky"), 2)) > limit(
-        1
-    )  # collisions alone find no derivative where nothing scatters
+    # Collisions alone find no derivative where nothing scatters.
+    assert score(MitsubaRenderer(scene(voxels(), lights="sky"), 2)) > limit(1)
 
 
 @pytest.mark.slow
