@@ -529,12 +529,25 @@ def test_smooth_differences_far_below_the_noise_of_a_pixel_take_standard_errors_
     made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [ur.View(reference.astype(np.float32))])
     fitted = np.linalg.lstsq(spot.reshape(-1, 1), (reference - scenery).ravel(), rcond=None)[0]
     ends = [scenery + fitted * spot + random.normal(0.0, 0.02, scenery.shape) for _ in range(2)]
+    ends[0][0, 0] = np.nan  # this pixel alone does not count
     found = check_numbers(made, {"a": fitted.astype(np.float32)}, made.initial_values(), FAR, ends={0: ends})
     assert bool(found.distorted) == bool(words) == ("a" not in found.errors)
     assert re.search(words, found.distorted)
     stated = ur.runs.uncertainty(made, {"a": fitted.astype(np.float32)}, seed=seed)
     assert bool(words) == ("a" not in stated.standard_error)
     assert re.search(words, " ".join(stated.missing))
+
+
+def test_pixels_out_of_the_mask_that_are_not_finite_leave_the_others_tested() -> None:
+    """Nothing was tested, in silence: the weight 0 times a value that is no number is none."""
+    random, size = np.random.default_rng(0), (16, 16)
+    matrix, offset, mask = random.random((16 * 16 * 3, 1)), np.full((*size, 3), 0.1), np.ones(size)
+    reference = (0.5 * matrix).reshape(offset.shape) + offset + random.normal(0.0, 0.02, offset.shape)
+    mask[2, 5], offset[2, 5, 1] = 0.0, np.nan
+    renderer = AnalyticRenderer({"a": np.zeros(1)}, matrix, offset=offset, noise=0.1, grain=0.1, shape=size)
+    made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.3])], [ur.View(reference.astype(np.float32), mask=mask)])
+    found = check_numbers(made, {"a": np.full(1, 0.5, np.float32)}, made.initial_values(), FAR)
+    assert 0.0 < found.errors["a"][0] < 0.01
 
 
 def test_no_time_no_check():

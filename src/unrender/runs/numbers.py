@@ -233,7 +233,8 @@ class Numbers:
         for view in self.views:
             request = SampleRequest(self.problem.views[view].sensor, self.spp, key.fold(view).uint32())
             images = arrays.numpy(session.image_batch(batch, request)).astype(np.float64)
-            parts.append(images.reshape(count, -1, 3) * self.roots(view))
+            roots = self.roots(view)
+            parts.append(np.where(roots > 0.0, images.reshape(count, -1, 3), 0.0) * roots)
             timing.add(self.spp * (images.size // 3))
         return np.concatenate(parts, axis=1)
 

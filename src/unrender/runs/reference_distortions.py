@@ -60,8 +60,10 @@ def unexplained_share(numbers: Numbers, slopes: np.ndarray, inverse: np.ndarray)
         return 0.0
     ends = np.concatenate([np.mean(numbers.ends[v], axis=0).reshape(-1, 3) * numbers.roots(v) for v in numbers.views])
     ends = ends - numbers.references()
+    finite = np.asarray(np.isfinite(ends).all(axis=1))
+    ends = np.where(finite[:, None], ends, 0.0)
     left = ends - np.tensordot(inverse @ np.tensordot(slopes, ends, axes=2), slopes, axes=1)
-    counted = np.concatenate([numbers.roots(view).any(axis=1) for view in numbers.views])
+    counted = finite & np.concatenate([numbers.roots(view).any(axis=1) for view in numbers.views])
     size = math.sqrt(max(float(np.square(numbers.references()).mean()), 1e-300))
     shared = in_blocks(left, counted, [numbers.problem.sizes[view] for view in numbers.views], _LEAST_SHARE * size)
     share = math.sqrt(max(shared.mean_square, 0.0)) / size
