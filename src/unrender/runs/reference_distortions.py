@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.display import formatting
 from unrender.statistics import scores
-from unrender.statistics.paired_losses import SIGNIFICANT, in_blocks, slices_of_images
+from unrender.statistics.paired_losses import SIGNIFICANT, in_blocks, mean_square, slices_of_images
 
 if TYPE_CHECKING:
     from unrender.runs.numbers import Numbers
@@ -64,7 +64,7 @@ def unexplained_share(numbers: Numbers, slopes: np.ndarray, inverse: np.ndarray)
     ends = np.where(finite[:, None], ends, 0.0)
     left = ends - np.tensordot(inverse @ np.tensordot(slopes, ends, axes=2), slopes, axes=1)
     counted = finite & np.concatenate([numbers.roots(view).any(axis=1) for view in numbers.views])
-    size = math.sqrt(max(float(np.square(numbers.references()).mean()), 1e-300))
+    size = math.sqrt(max(mean_square(numbers.references(), counted), 1e-300))
     shared = in_blocks(left, counted, [numbers.problem.sizes[view] for view in numbers.views], _LEAST_SHARE * size)
     share = math.sqrt(max(shared.mean_square, 0.0)) / size
     return share if shared.score > SIGNIFICANT and share > _LEAST_SHARE else 0.0
