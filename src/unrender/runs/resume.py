@@ -131,17 +131,18 @@ def resume_run(
 
 
 def _prepared(stored: StoredRun, problem: Problem, estimator: Estimator | None, optimizer: Optimizer | None) -> Run:
-    """Return the run before its first step. If its method does not suit the problem, an `InputError` says what has changed."""
+    """Return the run before its first step. If its method does not suit a problem of other parts, an `InputError` says what changed."""
     method, table = stored.method, stored.method.model_dump()
     try:
         plan = Plan.from_table(problem, table, str(stored.folder / METHOD), estimator, optimizer)
         check(plan.estimator, plan.optimizer, method.steps, method.seconds)
         return prepare(plan, method.steps, method.seconds, method.seed)
     except InputError as error:
-        before, now = stored.record.problem.fingerprint or {}, fingerprint(problem)
-        if not (changes := differences({part: x for part, x in before.items() if part not in PARTS}, now)):
+        fingerprints = stored.record.problem.fingerprint or {}
+        before, now = {part: x for part, x in fingerprints.items() if part not in PARTS}, fingerprint(problem)
+        if before.keys() == now.keys():  # the method itself is at fault, such as a type that is not installed
             raise
-        told = f"run folder {stored.folder}: changed since: {shortened(changes)}"
+        told = f"run folder {stored.folder}: changed since: {shortened(differences(before, now))}"
         raise InputError(
             f"{told}; its method does not suit these changes; start a new run, by `unrender run`"
         ) from error
