@@ -138,7 +138,7 @@ def cost_of_end(samples: float, steps: int) -> float:
 
 
 def cost_of_numbers(samples: float, steps: int) -> float:
-    """Return those of them that the check of few numbers may take."""
+    """Return the seconds of `cost_of_end` that the check of few numbers may take."""
     return max(_END_OF_STEPS * _cost_of_steps(samples, steps), _LEAST_NUMBERS)
 
 

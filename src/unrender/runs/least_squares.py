@@ -281,10 +281,12 @@ class _Fit:
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
         seen = np.where(hidden[:, None, None], 0.0, slopes)
-        kept = np.where(hidden, 0.0, inverse)
-        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, kept)
-        told = distortion, changes[:n] @ moves, unexplained_share(numbers, seen, kept)
-        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better, beyond, *told)
+        seen_inverse = np.where(hidden, 0.0, inverse)
+        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, seen_inverse)
+        return cls(
+            total, error, own, step[:n], unseen[:, hidden], blind, better, beyond,
+            distortion, changes[:n] @ moves, unexplained_share(numbers, seen, seen_inverse),
+        )  # fmt: skip
 
 
 def _better(residuals: np.ndarray, before: np.ndarray) -> float:

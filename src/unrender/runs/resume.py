@@ -104,7 +104,7 @@ def resume_run(
     run = _prepared(stored, problem, estimator, optimizer)
     run.folder = folder
     run.begin_budget(began)
-    run.initial, found = first_values(run), fingerprint_of(run)
+    run.initial, fingerprints = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
             changes = _changes(run, stored, source.checkpoint)
@@ -117,7 +117,7 @@ def resume_run(
                 run.ahead = _ahead(source.checkpoint)
                 initialize(run, max(source.checkpoint.manifest.step - 1 + run.ahead, 0))
             restoring = _Restore(stored.record, source, changes, writer)
-            run.description, run.history, run.warmup_seconds = _description(run, stored, found), [], 0.0
+            run.description, run.history, run.warmup_seconds = _description(run, stored, fingerprints), [], 0.0
             try:
                 with connected(run, callbacks, (restoring, writer), earlier):
                     result = descend(run)
@@ -142,9 +142,9 @@ def _prepared(stored: StoredRun, problem: Problem, estimator: Estimator | None, 
         before, now = {part: x for part, x in fingerprints.items() if part not in PARTS}, fingerprint(problem)
         if before.keys() == now.keys():  # the method itself is at fault, such as a type that is not installed
             raise
-        told = f"run folder {stored.folder}: changed since: {shortened(differences(before, now))}"
         raise InputError(
-            f"{told}; its method does not suit these changes; start a new run, by `unrender run`"
+            f"run folder {stored.folder}: changed since: {shortened(differences(before, now))}; its method does not suit these changes; "
+            "start a new run, by `unrender run`"
         ) from error
 
 
