@@ -390,3 +390,15 @@ def test_a_flag_that_is_not_true_or_false_is_refused(of: Any, flag: str) -> None
     with pytest.raises(InputError, match=f"^{of.__name__}: {flag} must be true or false, got 'false'"):
         of(**arguments | {flag: "false"})
     assert of(**arguments | {flag: np.bool_(getattr(of(**arguments), flag))}) == of(**arguments)
+
+
+@pytest.mark.parametrize("kind", ["method", "gallery problem"])
+def test_names_are_read_from_the_source_in_their_order(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = {
+        name: made_by
+        for name, made_by in registry.components(kind).items()
+        if made_by.__module__.startswith("unrender.")
+    }
+    monkeypatch.setattr(registry, "_components", {})
+    monkeypatch.setattr(registry, "components", lambda kind: pytest.fail(f"imports each {kind}"))
+    assert registry.names(kind) == list(own)

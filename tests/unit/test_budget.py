@@ -99,7 +99,7 @@ def test_a_long_step_warms_up_once(pause: float, resumed: bool, steps: int, monk
     monkeypatch.setattr(time, "sleep", lambda seconds: (paused.append(seconds), now.__setitem__(0, now[0] + seconds)))
     run = loop.prepare(Plan(problem(), slow(pause), ur.optimizers.Adam(0.01)), None, 4.0, 0)
     run.begin_budget(now[0])
-    run.description |= {"resumed": []} if resumed else {}
+    run.resumed = [] if resumed else None
     seconds, _ = loop.warm_up(run)
     assert (len(paused), seconds, run.trial[0]) == (steps, pytest.approx(steps * pause), pytest.approx(pause))
 

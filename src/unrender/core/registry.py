@@ -20,6 +20,7 @@ import dataclasses
 import functools
 import importlib
 import importlib.metadata
+import importlib.util
 import logging
 import math
 import pkgutil
@@ -28,6 +29,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from unrender.core.errors import InputError
@@ -98,6 +100,7 @@ class Component:
 _components: dict[tuple[str, str], Component] = {}
 """Components by (namespace, name). All kinds that occur in tables share one namespace; each other kind has its own."""
 
+_DECLARED = re.compile(r'^@register\(name="([\w-]+)", position=(\d+)\)', re.MULTILINE)
 _state_modules: set[str] = set()
 _loaded: set[str] = set()
 _lock = threading.RLock()
@@ -140,6 +143,20 @@ def register(
     return _add(component, name, kind, states, position)
 
 
+def names(kind: str) -> list[str]:
+    """Return the names of `components(kind)`, in their order. Raises `InputError` for an unknown kind.
+
+    Names of methods and gallery problems are read from the source, because the import of their modules takes a second. Other packages
+    must be imported.
+    """
+    package, known = _check_kind(kind).package, any(each.kind == kind for each in _components.values())
+    spec = None if known or importlib.metadata.entry_points(group=GROUP) else importlib.util.find_spec(package)
+    folders = (spec and spec.submodule_search_locations) or ()
+    texts = [path.read_text("utf-8") for folder in folders for path in Path(folder).glob("*.py")]
+    found = sorted((int(position), name) for text in texts for name, position in _DECLARED.findall(text))
+    return [name for _, name in found] or list(components(kind))
+
+
 def components(kind: str) -> dict[str, type]:
     """Return {name: class} of the components of a kind, sorted by position. Raises `InputError` for an unknown kind."""
     _check_kind(kind)
@@ -155,13 +172,18 @@ def table_components() -> dict[str, type]:
     }
 
 
-def find(kind: str, name: str) -> type:
-    """Return the component of this kind and name. Raises `InputError` that suggests the nearest known name."""
-    known = components(kind)
+def check_name(kind: str, name: str) -> None:
+    """Raise `InputError` that suggests the nearest known name if there is no component of this kind and name."""
+    known = names(kind)
     if name not in known:
         hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
         raise InputError(f"unknown {kind} {name}{hint}")
-    return known[name]
+
+
+def find(kind: str, name: str) -> type:
+    """Return the component of this kind and name. Raises `InputError` that suggests the nearest known name."""
+    check_name(kind, name)
+    return components(kind)[name]
 
 
 def component_of(made_by: type) -> Component | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from unrender.core import registry
@@ -35,6 +36,11 @@ def options(name: str) -> list[Option]:
     return fields.of(_specification(name))
 
 
+def check(name: str, options: Mapping[str, Any]) -> Any:
+    """Return the specification with these options. Raises `InputError` as `problem` does."""
+    return fields.fill(name, _specification(name), options)
+
+
 @exclusive("gallery.problem")
 def problem(name: str, **options: Any) -> Problem:
     """Return a problem made by code: scene, references, initial values and, if they exist, true values.
@@ -55,7 +61,7 @@ def problem(name: str, **options: Any) -> Problem:
         InputError: the name or an option is unknown, or an option is out of range.
         VariantError: Mitsuba cannot run on this machine.
     """
-    specification = fields.fill(name, _specification(name), options)
+    specification = check(name, options)
     with notebook.shown():
         if isinstance(specification, ProblemSource):
             made = specification.problem(name)

@@ -40,7 +40,7 @@ that a line names."""
 _LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
 """Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
 _PAGE_SECONDS = 1.0  # time of the page and the summary on an idle machine
-_END_OF_STEPS, _LEAST_END, _LEAST_NUMBERS = 1 / 3, 1.5, 0.5
+_END_OF_STEPS, LEAST_END, LEAST_NUMBERS = 1 / 3, 1.5, 0.5
 """Most cost of the final pictures and tests of a run without a budget in seconds, relative to that of its steps; its minimum, with .5 a run
 of 80 steps of a wall of 400 texels had no standard errors; and the minimum for the check of few numbers."""
 _OF_STEP = 2  # cost of a path of a step, and launches of a step, relative to a rendering: most steps have an adjoint
@@ -132,14 +132,9 @@ def _cost_of_steps(samples: float, steps: int) -> float:
     return timing.cost(_OF_STEP * samples, _OF_STEP * steps)
 
 
-def cost_of_end(samples: float, steps: int) -> float:
+def cost_of_end(samples: float, steps: int, least: float = LEAST_END) -> float:
     """Return the seconds that final pictures and tests may take if renderings are counted, from the samples of all steps."""
-    return max(_END_OF_STEPS * _cost_of_steps(samples, steps), _LEAST_END)
-
-
-def cost_of_numbers(samples: float, steps: int) -> float:
-    """Return the seconds of `cost_of_end` that the check of few numbers may take."""
-    return max(_END_OF_STEPS * _cost_of_steps(samples, steps), _LEAST_NUMBERS)
+    return max(_END_OF_STEPS * _cost_of_steps(samples, steps), least)
 
 
 def _warn_of_few_steps(run: Run) -> None:

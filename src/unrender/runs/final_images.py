@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
-from unrender.runs.budget import MOST_SLOWDOWN, cost_of_numbers, seconds_of_steps, slowdown
+from unrender.runs.budget import LEAST_NUMBERS, MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
 from unrender.runs.determination import (
     common_factor,
     undetermined,
@@ -265,7 +265,8 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
     of_numbers = allowed
     if timing.counts():
-        of_numbers = min(max(allowed, _NUMBERS_COUNTED), cost_of_numbers(result.history[-1]["samples"], result.steps))
+        end = cost_of_end(result.history[-1]["samples"], result.steps, LEAST_NUMBERS)
+        of_numbers = min(max(allowed, _NUMBERS_COUNTED), end)
     given = of_numbers, sensitivities, tests.weights, stated, dict(enumerate(tests.ends))
     numbers = check_numbers(problem, result.parameters, result.initial, *given)
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))

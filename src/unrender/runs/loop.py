@@ -132,7 +132,7 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         _gradient_noise(run, estimate)
         whole.trial = time.perf_counter() - began, int(estimate.info.get("samples", 0))
         is_long = run.deadline is not None and whole.trial[0] > _LONG_STEP * (run.seconds or math.inf)
-        if is_long and kernels == cache.kernels_changed() and "resumed" not in run.description:
+        if is_long and kernels == cache.kernels_changed() and run.resumed is None:
             break
     return time.perf_counter() - started, run.snapshot()
 

@@ -102,7 +102,7 @@ def resume_run(
     """Resume the run. See `unrender.resume`; `earlier` contains the seconds of earlier phases; `began`: see `RunAnnotations`."""
     folder, method = stored.folder, stored.method
     run = _prepared(stored, problem, estimator, optimizer)
-    run.folder = folder
+    run.folder, run.resumed = folder, stored.record.resumed
     run.begin_budget(began)
     run.initial, fingerprints = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
@@ -159,7 +159,7 @@ def _description(run: Run, stored: StoredRun, fingerprint: dict[str, str]) -> di
     annotations = RunAnnotations(record.method, settings, record.choices, record.command, stored.method.final_spp)
     description = describe_run(run, annotations)
     description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
-    return {**description, "resumed": record.resumed}
+    return description
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class _Restore(Callback):
         warnings += [f"resumed with force although changed since: {self.changes}"] if self.changes else []
         saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
         run.history[:] = (record for record in source.records if record["step"] < saved["step"])
-        run.description["resumed"] = [*self.record.resumed, saved["step"]]
+        run.resumed = [*self.record.resumed, saved["step"]]
         run.warmup_seconds += self.record.warmup_seconds
         run.restore(saved)
         if self.record.stopped == NON_FINITE:  # resuming a stopped run means another attempt

@@ -52,6 +52,7 @@ class Run:
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
             covers the steps only.
+        resumed: steps after which the run was resumed; None for a new run.
         before: seconds of the budget before the first step.
         grace: seconds after the deadline at which the end of the run may still be busy.
         trial: seconds and samples of the last step of the warm-up.
@@ -82,6 +83,7 @@ class Run:
     warnings: list[str] = field(default_factory=list)
     few_steps: str = ""
     stopped: str = ""
+    resumed: Sequence[int] | None = None
     last_step: float | None = None
     deadline: float | None = None
     before: float = 0.0
@@ -150,6 +152,7 @@ class Run:
             skipped=self.skipped,
             warnings=[*self.warnings, *(line for callback in self.callbacks for line in callback.warnings(self))],
             info=to_numpy(self.estimate.info) if info and self.estimate else {},
+            resumed=self.resumed or (),
             adapted=list(optimizer.choices(state)) if isinstance(optimizer, Choosing) else [],
             standard_error=self._standard_errors(),
             pixel_weights=pixel_weights(self.estimator, self.state.estimator),

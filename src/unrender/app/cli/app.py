@@ -14,6 +14,7 @@ from unrender.app.cli.import_ import import_
 from unrender.app.cli.results import export, judge, report, turntable, watch
 from unrender.app.cli.run import resume, run
 from unrender.app.cli.sweep import sweep_command
+from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
 
@@ -46,6 +47,8 @@ def gallery(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this problem.")] = None,
 ) -> None:
     """List the gallery's problems, or the options of one."""
+    if name is not None:
+        registry.check_name("gallery problem", name)  # before the slow imports
     from rich.markup import escape
 
     from unrender import gallery as problems
@@ -94,6 +97,8 @@ def methods(
         return
     if unused := arguments.typed_options(context):
         raise InputError(f"methods: {unused[0]} needs --plan PROBLEM")
+    if name:
+        registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
     from unrender.methods import methods as registered
 
@@ -107,10 +112,13 @@ def methods(
 def _print_plan(
     problem: str, name: str, settings: dict[str, str], problem_settings: list[str] | None, variant: str
 ) -> None:
+    options = arguments.settings(problem_settings, "--problem-set")
+    arguments.check_file(problem)
+    registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
     from unrender.methods.plan import plan_text
 
-    chosen, options = method(name), arguments.settings(problem_settings, "--problem-set")
+    chosen = method(name)
     chosen.start(settings)
     arguments.check_problem(problem, options)
     arguments.use_variant(variant)

@@ -9,12 +9,13 @@ import re
 import shlex
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from unrender.backend import cache, variant
-from unrender.core import phases
+from unrender.core import phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import LARGEST_SEED
 from unrender.core.text import did_you_mean
@@ -173,8 +174,19 @@ def use_variant(name: str, threads: int | None = None) -> str:
     return chosen
 
 
-def check_file(name: str) -> None:
-    """Raise `InputError` for a problem file, not one of stages, that is missing or has invalid fields, before the slow imports."""
+def is_gallery(name: str) -> bool:
+    """Return whether a gallery problem has this name."""
+    return name in registry.names("gallery problem")
+
+
+def check_file(name: str, options: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Raise `InputError` for an unknown name, for options that a gallery problem lacks, or for a problem file, not one of stages, that is
+    missing or has invalid fields, before the slow imports."""
+    _check_known(name)
+    if options and is_gallery(name):
+        from unrender import gallery
+
+        gallery.check(name, {key: literal(value) for key, value in options.items()})
     file = Path(name)
     if file.suffix.lower() != ".toml":
         return
@@ -193,10 +205,7 @@ def check_problem(name: str, options: Mapping[str, str], cached: bool = True) ->
 
     `cached` is False if --no-cache was typed.
     """
-    from unrender import gallery
-
-    if name not in gallery.names() and Path(name).is_dir():
-        raise InputError(f"{name}: a folder, expected a problem file{_in_folder(Path(name))}")
+    _check_known(name)
     if _is_file(name):
         if Path(name).suffix.lower() not in ("", ".toml", ".xml"):
             raise InputError(f"{name}: expected a problem file, whose name ends in .toml")
@@ -214,10 +223,18 @@ def check_problem(name: str, options: Mapping[str, str], cached: bool = True) ->
 
             raise InputError(f"{name}: {bounded_files.no_file(Path(name))}")
         refuse_stages(name)
-    elif name not in gallery.names():
-        file = f"; did you mean {name}.toml?" if Path(f"{name}.toml").is_file() else ""
-        hint = file or did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
-        raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
+
+
+def _check_known(name: str) -> None:
+    """Raise `InputError` for a name that is neither that of a file nor in the gallery, and for a folder."""
+    if (_is_file(name) and not Path(name).is_dir()) or is_gallery(name):
+        return
+    if Path(name).is_dir():
+        raise InputError(f"{name}: a folder, expected a problem file{_in_folder(Path(name))}")
+    known = registry.names("gallery problem")
+    file = f"; did you mean {name}.toml?" if Path(f"{name}.toml").is_file() else ""
+    hint = file or did_you_mean(name, known) or f" ({', '.join(known)})"
+    raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
 
 
 def _in_folder(folder: Path) -> str:
@@ -328,6 +345,13 @@ def command_line(context: typer.Context) -> str:
 def began(context: typer.Context) -> float | None:
     """Return when the process began to start the command, on the clock of `time.perf_counter`; None if unknown."""
     return (context.find_root().obj or (None, ()))[0]
+
+
+def check_folder(directory: Path) -> None:
+    """Raise `InputError` for a run folder that does not exist, before the slow imports."""
+    if not directory.is_dir():
+        what = "a file, expected a run folder" if directory.exists() else "no such run folder"
+        raise InputError(f"{directory}: {what}")
 
 
 def finished_run(directory: Path) -> Path:

@@ -15,7 +15,7 @@ import typer
 from unrender.app.cli import arguments
 from unrender.app.cli.run import exit_status
 from unrender.app.cli.signals import DOUBTFUL, FAILED
-from unrender.core import phases
+from unrender.core import phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 from unrender.display import formatting
@@ -87,6 +87,7 @@ def compare(
         return _compare_folders(console, context, [Path(name) for name in what], out, overwrite)
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    arguments.check_file(what[0], options)
     with Progress(console) as progress:
         by_method = _methods_and_settings(methods, typed)
         arguments.check_problem(what[0], options, not no_cache)
@@ -287,11 +288,12 @@ def _methods_and_settings(names: str | None, typed: Mapping[str, str]) -> dict[s
 
 
 def _parse_methods(names: str | None) -> list[Method]:
+    listed = _DEFAULT if names is None else [name.strip() for name in names.split(",") if name.strip()]
+    for name in listed:
+        registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
 
-    if names is None:
-        return [method(name) for name in _DEFAULT]
-    chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
+    chosen = [method(name) for name in listed]
     if not chosen:
         raise InputError("--methods: expected at least one name")
     for one in chosen:

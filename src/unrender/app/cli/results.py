@@ -50,6 +50,7 @@ def judge(
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
+    arguments.check_folder(directory)
     with Progress(console):
         arguments.use_variant(variant)
         from unrender.app.evaluation.judge import judge as measure
@@ -106,12 +107,11 @@ def turntable(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Write a video of one rotation of a run's result before a camera and a light."""
+    arguments.check_folder(directory)
     from unrender.app.evaluation import turntable
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
-    if not directory.is_dir():
-        raise InputError(f"{directory}: no such run folder")
     directory = arguments.finished_run(directory)
     notices: list[str] = []
     place = directory / ("turntable.mp4" if turntable.has_ffmpeg() else "turntable.gif") if out is None else out
@@ -206,6 +206,7 @@ def report(
     ],
 ) -> None:
     """Rewrite the page of a run folder, or of a sweep's best trials, and print its path."""
+    arguments.check_folder(directory)
     from unrender.app.sweeps.record import SWEEP, read_sweep
 
     if (directory / SWEEP).is_file():

@@ -12,7 +12,7 @@ import typer
 
 from unrender.app.cli import arguments, stages
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
-from unrender.core import phases
+from unrender.core import phases, registry
 from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -94,10 +94,10 @@ def run(
     PROBLEM may also be a file of stages: each stage has a run folder and starts from the result of the previous stage. Ctrl-C and
     SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
-    arguments.check_file(problem)
     values, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     steps, seconds = _budget_settings(values, steps, seconds)
     budget = arguments.budget(steps, seconds)
+    arguments.check_file(problem, options)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
@@ -131,6 +131,8 @@ def run(
 
 
 def _method(name: str) -> Method | PlanFile:
+    if not name.endswith(".toml"):
+        registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
     from unrender.methods.plan import SUFFIX, PlanFile
 
@@ -220,6 +222,7 @@ def resume(
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
+    arguments.check_folder(directory)
     if steps is not None or seconds is not None:
         steps, seconds = arguments.budget(steps, seconds)
     if (directory / "stages.toml").is_file() and not (directory / "run.json").is_file():

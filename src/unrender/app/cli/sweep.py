@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from unrender.app.cli import arguments
-from unrender.core import phases
+from unrender.core import phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 
@@ -90,14 +90,16 @@ def sweep_command(
     folder, one per seed, in one folder with sweep.json. `unrender sweep DIR` continues an interrupted or killed sweep.
     """
     arguments.budget(steps, seconds)
-    from unrender import gallery
+    if not Path(what).is_dir():
+        arguments.check_file(what)
+        registry.check_name("method", method_name)  # before the slow imports
     from unrender.app.cli.sweep_driver import Session, run_trials
     from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console
 
     console = Console(highlight=False)
     where = arguments.workers(workers, insecure)
-    if Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names()):
+    if Path(what).is_dir() and (Path(what, MARK).exists() or not arguments.is_gallery(what)):
         if refused := arguments.typed_options(context, _FREE):
             raise InputError(f"sweep {what}: continues with its original options; leave out {refused[0]}")
         record = _extended(read_sweep(Path(what)), trials)

@@ -24,7 +24,7 @@ from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
-from unrender.runs.budget import can_test, cost_of_end, cost_of_numbers
+from unrender.runs.budget import LEAST_NUMBERS, can_test, cost_of_end
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_checks import at_start, with_misfit
 from unrender.runs.final_images import render_final_images, warm_up
@@ -161,7 +161,8 @@ class RunWriter(Callback):
             run.tested = can_test(run)
             with phases.phase(callbacks.COMPILING):
                 steps = run.steps or 0
-                counted = math.inf if run.seconds else cost_of_numbers(steps * warm["samples"] / WARM_UP_STEPS, steps)
+                samples = steps * warm["samples"] / WARM_UP_STEPS
+                counted = math.inf if run.seconds else cost_of_end(samples, steps, LEAST_NUMBERS)
                 warm_up(run.problem, run.full(), run.tested, counted)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
