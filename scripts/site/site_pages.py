@@ -22,7 +22,7 @@ from unrender.app.capture.formats import lights
 from unrender.app.stages import stages_file
 from unrender.core import registry
 from unrender.display.pictures import png, shown_image
-from unrender.io import parameter_values
+from unrender.io import parameter_values, toml_lines
 from unrender.methods import method
 from unrender.rendering.mitsuba import turned_lights
 from unrender.runs.folder import schema
@@ -156,7 +156,7 @@ def files_page() -> str:
         parts.append(f"## {heading}")
         for name, model in tables.items():
             rows = []
-            for own, field in model.model_fields.items():
+            for own, field in toml_lines.fields_of(model).items():
                 default = "required" if field.is_required() else _code(field.get_default(call_default_factory=True))
                 rows.append(f"| `{field.alias or own}` | {default} | {_cell(field.description or '')} |")
             title = f"`[[{name}]]`" if name else "The file"

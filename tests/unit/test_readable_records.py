@@ -163,7 +163,9 @@ def test_a_seed_of_the_last_run_counts() -> None:
 
 
 def test_stages_of_a_name_that_is_no_unicode_are_refused(tmp_path: Path) -> None:
-    stages = stages_file.Stages(Path("/tmp/\udcff.toml"), (), "auto", None, 1, None, 0, None)
+    stages = stages_file.Stages(
+        Path("/tmp/\udcff.toml"), (stages_file.Stage("a", ("b",)),), "auto", {}, 1, None, 0, None
+    )
     with pytest.raises(InputError, match="not UTF-8"):
         stages_file.write(stages, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import pydantic
 from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
 
 from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
@@ -25,6 +26,7 @@ else:  # pragma: no cover
 Place = tuple[str | int, ...]
 """Path of a field: keys and indices from the top of the file."""
 
+_UNKNOWN = "extra_forbidden", "unexpected_keyword_argument"  # pydantic's errors about fields that a model lacks
 LARGEST = 3 << 17
 """Largest TOML file in bytes: `tomllib` takes half a second for this size."""
 _MOST_DOTS = 200, 1 << 15
@@ -206,10 +208,15 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-_M = TypeVar("_M", bound=Table)
+_M = TypeVar("_M")
 
 
-def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tuple[_M, str]:
+def fields_of(model: Any) -> Mapping[str, FieldInfo]:
+    """Return the fields of a table's model, a `Table` or a pydantic dataclass."""
+    return model.model_fields if issubclass(model, Table) else model.__pydantic_fields__
+
+
+def read(file: Path, model: type[_M], tables: Mapping[str, type]) -> tuple[_M, str]:
     """Return a file's content, and its text with Unix line ends for `error_at`.
 
     Args:
@@ -222,10 +229,10 @@ def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tupl
     text = bounded_files.read_text(file, LARGEST).replace("\r\n", "\n")
     content = parse(text, str(file))
     try:
-        return model.model_validate(content), text
+        return pydantic.TypeAdapter(model).validate_python(content), text
     except pydantic.ValidationError as error:
         # Report an unknown field first: if a name is misspelt, the correct one is missing too.
-        details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+        details = sorted(error.errors(), key=lambda detail: detail["type"] not in _UNKNOWN)
         raise error_at(file, text, *_explain(details[0], content, model, tables)) from error
 
 
@@ -233,7 +240,7 @@ def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
     return InputError(f"{file}:{find(text, place)}: {dotted(place)}: {what}")
 
 
-def _explain(detail: Any, content: Any, model: type[Table], tables: Mapping[str, type[Table]]) -> tuple[Place, str]:
+def _explain(detail: Any, content: Any, model: type, tables: Mapping[str, type]) -> tuple[Place, str]:
     """Return the place and message of one of pydantic's errors about the content of a file, without pydantic's additions for unions and
     tuples."""
     location = detail["loc"]
@@ -241,8 +248,8 @@ def _explain(detail: Any, content: Any, model: type[Table], tables: Mapping[str,
     if len(location) >= 2 and location[0] in tables:
         model, place = tables[location[0]], location[: 3 if isinstance(location[1], int) else 2]
     name = str(place[-1]) if place else ""
-    fields = {field.alias or own: field for own, field in model.model_fields.items()}
-    if detail["type"] == "extra_forbidden" and name not in fields:
+    fields = {field.alias or own: field for own, field in fields_of(model).items()}
+    if detail["type"] in _UNKNOWN and name not in fields:
         names = ", ".join(fields)
         return place, f"no such field{did_you_mean(name, fields) or f'; there are {names}'}"
     expected = fields[name].description if name in fields else "a table"

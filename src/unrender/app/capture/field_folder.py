@@ -121,7 +121,7 @@ def _stages(voxels: int, moved: Sequence[str]) -> Stages:
     keys, result, coarser = tuple(_KEYS[one] for one in moved), [], 1
     while voxels / coarser >= 1:
         side = -(-voxels // coarser)
-        more = {"pixels": _PIXELS * side // _PIXELS_FOR} if side > _PIXELS_FOR else None
+        more: dict[str, Any] = {"pixels": _PIXELS * side // _PIXELS_FOR} if side > _PIXELS_FOR else {}
         result.insert(0, Stage(f"voxels-{side}", keys, 1.0, coarser, settings=more))
         if voxels // coarser <= _COARSEST:
             break

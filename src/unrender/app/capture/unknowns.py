@@ -127,14 +127,12 @@ def stages(unknowns: Sequence[str], problem: Path) -> Stages:
     of, result = keys(unknowns), []
     moved: list[str] = []
 
-    def add(
-        name: str, more: Sequence[str], share: float, coarser: int = 1, settings: dict[str, Any] | None = None
-    ) -> None:
+    def add(name: str, more: Sequence[str], share: float, coarser: int = 1, settings: Any = ()) -> None:
         new = [one for one in more if one in unknowns]
         if new:
             moved.extend(one for one in new if one not in moved)
             moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
-            result.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
+            result.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=dict(settings)))
 
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
     add("materials", (*_MATERIALS, "poses"), 3.0)

@@ -235,7 +235,7 @@ def _run_stage(
     settings = stages.settings_of(stage)
     chosen = method(stage.method or stages.method)
     shared = chosen.with_effect(problem, settings)  # those of all stages may have none in this one
-    for key in [key for key in settings if key not in shared and key not in (stage.settings or {})]:
+    for key in [key for key in settings if key not in shared and key not in stage.settings]:
         console.say(f"setting {key}={settings.pop(key)}: it has no effect in this stage, and is left out")
     last = index == len(stages.stages) - 1
     spp = run.options.final_spp or (None if last else 1)  # final pictures of many views take minutes

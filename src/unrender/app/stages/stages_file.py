@@ -23,123 +23,80 @@ a table [run] with the options of the run, which `unrender resume` uses.
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tomli_w
-from pydantic import Field, StrictFloat, StrictInt, StrictStr
+from pydantic import ConfigDict, Field, StrictFloat, StrictInt, StrictStr
+from pydantic.dataclasses import dataclass
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files, toml_lines
-from unrender.io.toml_lines import Place, Table
+from unrender.io.toml_lines import Place
 from unrender.runs.folder import schema
 
 FILE = "stages.toml"
 """Name of the file in the folder of an import, and in that of a run in stages."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
 _MOST = 99
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One run of several.
-
-    Attributes:
-        unknowns: keys of the parameters that it optimises; the others keep the values of earlier stages.
-        share: its share of the budget, relative to the other stages, > 0.
-        coarser: factor by which its textures and grids have fewer texels along each side, >= 1. They are interpolated at its end.
-        method: as on the command line; None for the default method.
-        settings: settings of the method, in addition to those of all stages.
-    """
-
-    name: str
-    unknowns: tuple[str, ...]
-    share: float = 1.0
-    coarser: int = 1
-    method: str | None = None
-    settings: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a run in stages that do not affect its results.
-
-    Attributes:
-        threads: number of threads; None for one per core.
-        checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
-    """
-
-    variant: str = "auto"
-    threads: int | None = None
-    checkpoint_every: int | None = None
-    final_spp: int | None = None
-
-
-@dataclass(frozen=True)
-class Stages:
-    """Consecutive runs of one problem, each of which starts at the result of the previous one.
-
-    Attributes:
-        stages: the stages, at least one.
-        method, settings: defaults of the stages.
-        steps, seconds: total budget of all stages; None without such a budget.
-        seed: seed of the first stage; later stages have consecutive seeds.
-        run: options of the run; None outside of the folder of a run.
-    """
-
-    problem: Path
-    stages: tuple[Stage, ...]
-    method: str = "auto"
-    settings: dict[str, Any] | None = None
-    steps: int | None = None
-    seconds: float | None = None
-    seed: int = 0
-    run: RunOptions | None = None
-
-    def settings_of(self, stage: Stage) -> dict[str, str]:
-        """Return the settings of the method in a stage, as on the command line."""
-        both = {**(self.settings or {}), **(stage.settings or {})}
-        return {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in both.items()}
-
-
+_CONFIG = ConfigDict(extra="forbid")
 _Positive = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
 _Setting = StrictStr | StrictInt | StrictFloat | bool
-
-
-class _Stage(Table):
-    name: StrictStr = Field(description="lower-case letters, digits and dashes, at most 40")
-    unknowns: list[StrictStr] = Field(
-        description="a list of at least one key of the problem's parameters", min_length=1
-    )
-    share: _Positive = Field(1.0, description="a number above 0")
-    coarser: Annotated[StrictInt, Field(ge=1, le=64)] = Field(1, description="a whole number from 1 to 64")
-    method: StrictStr | None = Field(None, description="the name of a method, see `unrender methods`")
-    settings: dict[StrictStr, _Setting] = Field({}, description="a table of the method's options, such as { spp = 4 }")
-
-
 _Count = Annotated[StrictInt, Field(ge=1)]
 
 
-class _Run(Table):
-    variant: StrictStr = Field("auto", description="a variant of Mitsuba")
-    threads: _Count | None = Field(None, description="a whole number of at least 1")
-    checkpoint_every: _Count | None = Field(None, description="a whole number of at least 1")
-    final_spp: _Count | None = Field(None, description="a whole number of at least 1")
+@dataclass(frozen=True, config=_CONFIG)
+class Stage:
+    """One run of several. `settings` are in addition to those of all stages."""
+
+    name: StrictStr = Field(description="lower-case letters, digits and dashes, at most 40")
+    unknowns: tuple[StrictStr, ...] = Field(
+        description="a list of at least one key of the problem's parameters", min_length=1
+    )
+    share: _Positive = Field(default=1.0, description="a number above 0")
+    coarser: Annotated[StrictInt, Field(ge=1, le=64)] = Field(default=1, description="a whole number from 1 to 64")
+    method: StrictStr | None = Field(default=None, description="the name of a method, see `unrender methods`")
+    settings: dict[StrictStr, _Setting] = Field(
+        default={}, description="a table of the method's options, such as { spp = 4 }"
+    )
 
 
-class _Stages(Table):
-    problem: StrictStr = Field(description="the path of a problem file")
-    stages: list[_Stage] = Field(description="at least one [[stages]] table", min_length=1, max_length=_MOST)
-    method: StrictStr = Field("auto", description="the name of a method, see `unrender methods`")
-    settings: dict[StrictStr, _Setting] = Field({}, description="a table of the method's options, such as { spp = 4 }")
-    steps: _Count | None = Field(None, description="a whole number of at least 1")
-    seconds: _Positive | None = Field(None, description="a number above 0")
-    seed: Annotated[StrictInt, Field(ge=0)] = Field(0, description="a whole number of at least 0")
-    run: _Run | None = Field(None, description="a table of a run's options")
+@dataclass(frozen=True, config=_CONFIG)
+class RunOptions:
+    """Options of a run in stages that do not affect its results, see `optimize` and `RunAnnotations`."""
+
+    variant: StrictStr = Field(default="auto", description="a variant of Mitsuba")
+    threads: _Count | None = Field(default=None, description="a whole number of at least 1")
+    checkpoint_every: _Count | None = Field(default=None, description="a whole number of at least 1")
+    final_spp: _Count | None = Field(default=None, description="a whole number of at least 1")
 
 
-TABLES: dict[str, type[Table]] = {"": _Stages, "stages": _Stage}
+@dataclass(frozen=True, config=_CONFIG)
+class Stages:
+    """Consecutive runs of one problem, each of which starts at the result of the previous one, with consecutive seeds.
+
+    `steps` and `seconds` are the total budget of all stages; `run` is None outside of the folder of a run.
+    """
+
+    problem: Path = Field(description="the path of a problem file")
+    stages: tuple[Stage, ...] = Field(description="at least one [[stages]] table", min_length=1, max_length=_MOST)
+    method: StrictStr = Field(default="auto", description="the name of a method, see `unrender methods`")
+    settings: dict[StrictStr, _Setting] = Field(
+        default={}, description="a table of the method's options, such as { spp = 4 }"
+    )
+    steps: _Count | None = Field(default=None, description="a whole number of at least 1")
+    seconds: _Positive | None = Field(default=None, description="a number above 0")
+    seed: Annotated[StrictInt, Field(ge=0)] = Field(default=0, description="a whole number of at least 0")
+    run: RunOptions | None = Field(default=None, description="a table of a run's options")
+
+    def settings_of(self, stage: Stage) -> dict[str, str]:
+        """Return the settings of the method in a stage, as on the command line."""
+        both = {**self.settings, **stage.settings}
+        return {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in both.items()}
+
+
+TABLES = {"": Stages, "stages": Stage}
 """Models of the tables of a file of stages, by name; "" is the file itself."""
 
 
@@ -166,13 +123,13 @@ def _parsed(path: Path) -> dict[str, Any]:
 def read(path: str | Path) -> Stages:
     """Read a TOML file of stages. Raises `InputError`, "stages.toml:12: stages[0].share: ...", with the expected value."""
     file = Path(path)
-    model, content = toml_lines.read(file, _Stages, {"stages": _Stage, "run": _Run})
+    stages, content = toml_lines.read(file, Stages, {"stages": Stage, "run": RunOptions})
     known: set[str] = set()
-    for index, stage in enumerate(model.stages):
+    for index, stage in enumerate(stages.stages):
         place: Place = ("stages", index, "name")
         what = ""
         if not _NAME.fullmatch(stage.name):
-            what = f"expected {_Stage.model_fields['name'].description}, got {stage.name!r:.60}"
+            what = f"expected {toml_lines.fields_of(Stage)['name'].description}, got {stage.name!r:.60}"
         elif stage.name in known:
             what = f"{stage.name} is given twice"
         elif len(set(stage.unknowns)) < len(stage.unknowns):
@@ -180,12 +137,7 @@ def read(path: str | Path) -> Stages:
         if what:
             raise toml_lines.error_at(file, content, place, what)
         known.add(stage.name)
-    stages = tuple(
-        Stage(s.name, tuple(s.unknowns), float(s.share), s.coarser, s.method, s.settings or None) for s in model.stages
-    )
-    problem = file.parent / model.problem
-    run = None if model.run is None else RunOptions(**model.run.model_dump())
-    return Stages(problem, stages, model.method, model.settings or None, model.steps, model.seconds, model.seed, run)
+    return replace(stages, problem=file.parent / stages.problem)
 
 
 def text(stages: Stages, note: str) -> str:
