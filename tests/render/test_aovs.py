@@ -16,11 +16,12 @@ import pytest
 import unrender as ur
 from tiers import quick
 from unrender.core.errors import InputError
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.picture_format import AOVS
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.determination import undetermined
-from unrender.runs.verification import misfit, residuals_of_views
+from unrender.runs.verification import misfit
 from unrender.scene.fingerprint import fingerprint
 
 pytestmark = pytest.mark.mitsuba
@@ -201,8 +202,7 @@ def test_a_wrong_depth_beside_colours_is_a_difference() -> None:
     views = [ur.View(np.full((SIZE, SIZE, 3), 0.04)), ur.View(np.full((SIZE, SIZE), 4.0), aov="depth")]
     noise = np.random.default_rng(0).normal(1.0, 1e-3, (2, 8, SIZE, SIZE, 3)).astype(np.float32)
     images = [list(0.04 * noise[0]), list(2.0 * noise[1])]
-    residuals, references, weights, sizes = residuals_of_views(problem(views, (MOVES,)), [0, 1], images)
-    found = misfit(residuals[0::2], residuals[1::2], references, weights, sizes, 0.05)
+    found = misfit(Residuals.of(problem(views, (MOVES,)), [0, 1], images), 0.05)
     assert found is not None
     assert found.error / found.size == pytest.approx(0.5 / np.sqrt(2.0), rel=0.01)
 

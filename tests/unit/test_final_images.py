@@ -21,6 +21,7 @@ from tests.analytic import AnalyticRenderer
 from tiers import quick, slow
 from unrender import losses, optimizers
 from unrender.core import phases
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.runs import determination, final_checks, final_images, joint_maps, least_squares
@@ -31,7 +32,7 @@ from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.runs.run import Run
-from unrender.runs.verification import NOISE, PRIOR, STEPS, STEPS_OF_FEW, Misfit, fit_status
+from unrender.runs.verification import NOISE, PRIOR, SMOOTH, STEPS, STEPS_OF_FEW, Misfit, fit_status
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
@@ -249,6 +250,10 @@ def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: p
     words = "as if the reference of view 0 were shifted"
     check = replace(check, undetermined={}, distorted=f"the pictures differ {words}")
     assert check.distorted in final_images.render_final_images(made, result).undetermined
+    smooth = replace(check, distorted=f"the pictures differ by 2 % {SMOOTH}")
+    monkeypatch.setattr(final_images, "check_numbers", lambda *_: smooth)
+    assert not final_images.render_final_images(made, result).undetermined
+    monkeypatch.setattr(final_images, "check_numbers", lambda *_: check)
     same = replace(found.misfit, explanation=f", {words}")
     monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: same)
     assert not final_images.render_final_images(made, result).undetermined
@@ -523,7 +528,8 @@ def test_a_few_bright_pixels_are_no_saturated_reference(clipped: bool) -> None:
     exact[0, :60] = 1.0 if clipped else exact[0, :60]
     images = exact + 0.01 * rng.standard_normal((4, *exact.shape[1:]))
     reference = np.minimum(exact[0], 0.6) - (0.0 if clipped else 0.02 * rng.random(exact.shape[1:]))
-    cause, _, _ = final_checks._as_if(images - reference, images, reference, np.ones(WIDE * WIDE), [(WIDE, WIDE)])
+    residuals = Residuals(images - reference, reference, np.ones(WIDE * WIDE), [(WIDE, WIDE)])
+    cause, _, _ = final_checks._as_if(residuals, images[1::2].mean(axis=0))
     assert cause.endswith("were saturated at 0.6 (set the loss Censored)") if clipped else "saturated" not in cause
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.runs import verification
 
 SIDE, SPP = 32, 1024
@@ -18,8 +19,8 @@ DEVIATION = 10.0 ** np.random.default_rng(4).uniform(-1, 1, (4, 4)).repeat(8, ax
 
 def told(reference_error: np.ndarray, seed: int, short: bool = False) -> verification.Misfit | None:
     noise = np.random.default_rng(seed).standard_t(6, (2, SIDE * SIDE, 3)) * DEVIATION / np.sqrt(1.5 * SPP)
-    arguments = np.full((SIDE * SIDE, 3), 7.0), np.ones(SIDE * SIDE), [(SIDE, SIDE)], SPP, short
-    return verification.as_few_samples(noise - reference_error, *arguments)
+    same = np.full((SIDE * SIDE, 3), 7.0), np.ones(SIDE * SIDE), [(SIDE, SIDE)]
+    return verification.as_few_samples(Residuals(noise - reference_error, *same), SPP, short)
 
 
 @pytest.mark.parametrize("samples", [8, 128, 1024])

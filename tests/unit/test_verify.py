@@ -14,7 +14,7 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from tiers import quick, slow
 from unrender.estimators import fresh_pictures
-from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.estimators.fresh_pictures import FreshPictures, Residuals
 from unrender.images.base import leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.runs import run, verification, verify
@@ -774,13 +774,12 @@ def test_a_resumed_run_keeps_the_same_parameters(tmp_path: Path) -> None:
 def test_a_difference_in_few_pixels_counts(improved: bool) -> None:
     """Single pixels, such as a lamp's reflection at another place of a mirror, are no difference that neighbours share."""
     generator, problem = np.random.default_rng(0), made()
-    references = np.full((512, 3), 0.1)
+    same = np.full((512, 3), 0.1), np.ones(512), [(16, 32)]
     residuals = generator.normal(0.0, 0.002, (4, 512, 3))
-    arguments = problem, residuals, references, np.ones(512), [(16, 32)]
-    assert not verification.misfit_of_numbers(*arguments, improved=improved)
+    assert not verification.misfit_of_numbers(problem, Residuals(residuals, *same), improved=improved)
     residuals[:, 7:512:32] += 0.15 * generator.choice((-1.0, 1.0), (16, 3))
     for images in (residuals, residuals[:2]):  # the two halves of a final picture
-        found = verification.misfit_of_numbers(problem, images, *arguments[2:], improved=improved)
+        found = verification.misfit_of_numbers(problem, Residuals(images, *same), improved=improved)
         assert found is not None
         assert found.line.startswith(verification.DIFFERS)
 
@@ -794,8 +793,8 @@ def test_many_poses_of_lights_must_fit_as_few_numbers_do(light: bool, monkeypatc
     problem = ur.Problem(renderer, [ur.Parameter(key) for key in keys], [ur.View(np.zeros((4, 4, 3)))])
     arguments: Any = np.ones((512, 3)), np.ones(512), [(16, 32)]
     noise = generator.normal(0.0, 0.01, (4, 512, 3))
-    assert not verification.misfit_of_numbers(problem, noise, *arguments)
-    found = verification.misfit_of_numbers(problem, 0.1 + noise, *arguments)
+    assert not verification.misfit_of_numbers(problem, Residuals(noise, *arguments))
+    found = verification.misfit_of_numbers(problem, Residuals(0.1 + noise, *arguments))
     assert (found is not None and "two lights are in each other's place" in found.line) is light
 
 
@@ -827,8 +826,8 @@ def test_a_wrong_line_of_pixels_at_the_border_of_a_reference_is_told(place: str,
         line = 0 if place.startswith(("top", "left")) else -1
         reference.swapaxes(0, int(place.endswith("column")))[line] = 0.5
     images = [light + scale * generator.normal(size=light.shape) for _ in range(2)]
-    one, other = ((image - reference).reshape(1, -1, 3) for image in images)
-    found = verification.misfit(one, other, light.reshape(-1, 3), np.ones(side * side), [(side, side)], 0.01)
+    residuals = np.stack([(image - reference).reshape(-1, 3) for image in images])
+    found = verification.misfit(Residuals(residuals, light.reshape(-1, 3), np.ones(side * side), [(side, side)]), 0.01)
     assert (found is not None and f"in its {place} of pixels" in found.line) is bool(place)
     assert bool(place) or found is None
 
@@ -900,14 +899,14 @@ def test_noise_of_the_references_in_few_pixels_is_no_difference(edge: float, out
         reference = 1.0 + deviation * generator.standard_t(6, (4096, 3))
         reference[generator.choice(4096, outliers, replace=False)] += generator.uniform(20.0, 60.0, (outliers, 1))
         residuals = 1.0 - reference + 2.0 * deviation * generator.standard_t(6, (2, 4096, 3))
-        arguments = problem, residuals, np.ones((4096, 3)), np.ones(4096), [(64, 64)]
-        assert not verification.misfit_of_numbers(*arguments)
+        of = Residuals(residuals, np.ones((4096, 3)), np.ones(4096), [(64, 64)])
+        assert not verification.misfit_of_numbers(problem, of)
 
 
 def test_noise_of_the_references_is_no_fault_where_the_true_values_leave_as_much() -> None:
     generator, problem = np.random.default_rng(0), made()
     residuals = 0.05 * generator.normal(size=(512, 3)) + generator.normal(0.0, 0.002, (4, 512, 3))
-    arguments = problem, residuals, np.full((512, 3), 0.1), np.ones(512), [(16, 32)]
+    arguments = problem, Residuals(residuals, np.full((512, 3), 0.1), np.ones(512), [(16, 32)])
     found = verification.misfit_of_numbers(*arguments, improved=False)
     assert found is not None
     assert "this picture's noise does not explain: the references are noisy, or" in found.line
@@ -947,10 +946,10 @@ def test_a_difference_that_changes_its_sign_within_tiles_is_told(axis: int, samp
     edges = 0.04 * np.array([1, -1, 0, 0, 0, 0, 0])[places[:, axis] % 7][:, None]
     noise = generator.normal(0.0, 0.02, (1, len(places), 3)) + generator.normal(0.0, 0.01, (4, len(places), 3))
     same = np.full((len(places), 3), 0.2), np.ones(len(places)), sizes
-    found = verification.misfit_of_numbers(problem, edges + noise, *same)
+    found = verification.misfit_of_numbers(problem, Residuals(edges + noise, *same))
     assert found is not None
     assert found.line.startswith(f"{verification.DIFFERS} by 0.0")
-    assert not verification.misfit_of_numbers(problem, noise, *same)
+    assert not verification.misfit_of_numbers(problem, Residuals(noise, *same))
 
 
 @pytest.mark.parametrize(
@@ -965,8 +964,8 @@ def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side:
         adjacent = float(np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2))
         assert 0.2 < adjacent < 0.5
         residuals = noise + generator.normal(0.0, 0.01, (4, side * side, 3))
-        arguments = problem, residuals, np.ones((side * side, 3)), np.ones(side * side), [(side, side)]
-        assert not verification.misfit_of_numbers(*arguments)
+        of = Residuals(residuals, np.ones((side * side, 3)), np.ones(side * side), [(side, side)])
+        assert not verification.misfit_of_numbers(problem, of)
 
 
 @pytest.mark.parametrize("status", [{}, [], None, 1, "else"])
@@ -983,9 +982,8 @@ def test_a_difference_along_edges_is_told_beside_filtered_noise_of_references() 
     edges = np.where(np.arange(side * side) // 6 % 2 < 1, 0.08, -0.08)[:, None]
     residuals = edges + 0.2 * seen_through_a_filter(generator, side) + generator.normal(0.0, 0.01, (4, side * side, 3))
     assert paired_losses.systematic(residuals.mean(axis=0), layout=(3, 1)).score < paired_losses.SIGNIFICANT
-    assert verification.misfit_of_numbers(
-        problem, residuals, np.ones((side * side, 3)), np.ones(side * side), [(side, side)]
-    )
+    of = Residuals(residuals, np.ones((side * side, 3)), np.ones(side * side), [(side, side)])
+    assert verification.misfit_of_numbers(problem, of)
 
 
 def test_a_difference_that_more_steps_may_answer_is_no_other_status() -> None:

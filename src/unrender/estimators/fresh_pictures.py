@@ -58,6 +58,64 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Residuals:
+    """Differences of K independent images of the same parameters from the references.
+
+    Pixels where an image is not finite have the difference and the weight 0.
+
+    Attributes:
+        images: differences, (K, N, 3), in an order that mostly keeps neighbours adjacent.
+        references: references, (N, 3).
+        weights: weight of each pixel, (N,), in [0, 1].
+        sizes: (height, width) of the images; [] for a sample of pairs, see `paired_losses.nearby`.
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    weights: np.ndarray
+    sizes: Sequence[tuple[int, int]]
+
+    def __post_init__(self):
+        finite = np.isfinite(self.images.sum(axis=(0, 2)))
+        object.__setattr__(self, "images", np.where(finite[:, None], self.images, 0.0))
+        object.__setattr__(self, "weights", self.weights * finite)
+
+    @classmethod
+    def of(cls, problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]]) -> Residuals:
+        """Return those of K images (H, W, 3) of each of some views. Views of AOVs beside others are in the unit of colours."""
+        references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
+        weights = np.concatenate([problem.test_weights(*of).ravel() for of in zip(views, images, strict=True)])
+        pixels = np.concatenate([image.reshape(-1, 3) for image in references])
+        residuals = np.stack(
+            [np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)]
+        )
+        sizes = [(height, width) for height, width, _ in map(np.shape, references)]
+        units = np.repeat(np.array(problem.units, np.float32)[list(views)], [math.prod(of) for of in sizes])[:, None]
+        return cls(residuals * units, pixels * units, weights, sizes)
+
+    @property
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means of every second image, from the first one and from the second one on, (N, 3) each, with independent noise."""
+        return self.images[0::2].mean(axis=0), self.images[1::2].mean(axis=0)
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square of the mean difference over pixels and channels."""
+        return paired_losses.mean_square(self.images.mean(axis=0), self.weights)
+
+    @property
+    def products(self) -> np.ndarray:
+        """Products of both halves, summed over channels and times the weights, (N,). Noise of the images does not change their mean."""
+        one, other = self.halves
+        return (one * other).sum(axis=1) * self.weights
+
+    @property
+    def size(self) -> float:
+        """Root mean square of the references."""
+        return math.sqrt(paired_losses.mean_square(self.references, self.weights))
+
+
+@dataclass(frozen=True)
 class _Frame:
     """Pixels of one view, all of which are rendered, or a list of pixels of all views (`view` is None), with view and row-major index of
     each, (N,), its reference (N, 3) and the factor of its loss (N, 1)."""
@@ -170,16 +228,10 @@ class FreshPictures:
             parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
         return np.concatenate(parts, axis=1)
 
-    def differences(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the differences (K, N, 3) of images (K, N, 3) of each frame from the references."""
-        return np.concatenate(images, axis=1) - self.references
-
-    def residual(self, images: Sequence[np.ndarray]) -> float:
-        """Return the mean square difference over pixels and channels between images (K, N, 3) of each frame and the references."""
-        means = np.concatenate([one.mean(axis=0) for one in images])
-        weights = self.weights[:, None] * np.isfinite(means)
-        squares = np.where(np.isfinite(means), means - self.references, 0.0) ** 2
-        return float((weights * squares).sum() / max(float(weights.sum()), 1e-300))
+    def compare(self, images: Sequence[np.ndarray]) -> Residuals:
+        """Return the differences of images (K, N, 3) of each frame from the references."""
+        differences = np.concatenate(images, axis=1) - self.references
+        return Residuals(differences, self.references, self.weights_of(images), self.sizes)
 
     @property
     def sizes(self) -> list[tuple[int, int]]:

@@ -12,14 +12,14 @@ import numpy as np
 from unrender.core import timing
 from unrender.core.errors import InputError
 from unrender.core.text import listed, names_in
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
 from unrender.runs.numbers import MOST_ELEMENTS, TOO_SHORT
 from unrender.runs.result import Result
-from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
+from unrender.runs.verification import LOST, Misfit, compares
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
-from unrender.statistics.paired_losses import mean_square
 
 _LEAST = 0.005
 """Relative change of the images below which a parameter counts as undetermined over its range."""
@@ -324,9 +324,8 @@ def with_lost(
     remeshed = problem.remeshed_from is not None  # the initial values are then those of another mesh
     if not keys or remeshed or len(ends[0]) < 2 or not compares(problem) or result.verification.get("best") != "end":
         return difference
-    residuals, references, weights, _ = residuals_of_views(problem, range(len(ends)), ends)
-    products = (residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1)
-    left = max(float(products @ weights) / max(3.0 * float(weights.sum()), 1e-300), 0.0)
+    residuals = Residuals.of(problem, range(len(ends)), ends)
+    left = max(float(residuals.products.sum()) / max(3.0 * float(residuals.weights.sum()), 1e-300), 0.0)
     start, end, lost, longest, spp = result.initial, result.parameters, [], 0.0, 4 * per_pass
     for key in keys:
         if remaining() <= longest:
@@ -348,7 +347,7 @@ def with_lost(
         f", and the pictures no longer depend on {listed(lost)} as they did at the start: try narrower bounds, a lower learning_rate, or a "
         "start closer to the references"
     )
-    difference = difference or Misfit(math.sqrt(left), math.sqrt(mean_square(references, weights)), 0.0)
+    difference = difference or Misfit(math.sqrt(left), residuals.size, 0.0)
     return replace(difference, explanation=explanation, causes=(LOST,))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.estimators.fresh_pictures import FreshPictures, Picture, Residuals
 from unrender.runs.verification import NOISE, STEPS, STEPS_OF_FEW, Misfit, compares, misfit, prior_cause
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
@@ -38,9 +38,9 @@ class EarlierImage:
     pictures: FreshPictures
 
     @property
-    def residuals(self) -> np.ndarray:
-        """Return the independent images minus the references, (K, N, 3)."""
-        return self.pictures.differences(self.picture.images)
+    def residuals(self) -> Residuals:
+        """Differences from the references."""
+        return self.pictures.compare(self.picture.images)
 
     @property
     def is_short(self) -> bool:
@@ -118,32 +118,23 @@ def least_difference(step: int) -> float:
 
 
 def no_improvement(
-    problem: Problem,
-    change: Mapping[str, Any],
-    loss: float,
-    steps: int,
-    residuals: np.ndarray,
-    references: np.ndarray,
-    weights: np.ndarray,
-    sizes: Sequence[tuple[int, int]],
+    problem: Problem, residuals: Residuals, change: Mapping[str, Any], loss: float, steps: int
 ) -> Misfit | None:
     """Return a difference of images of the end of a run from the references, of a tenth or more where the loss may still fall.
 
     Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
 
     Args:
+        residuals: those of K >= 2 independent images.
         change: "change" of `Result.verification`; {} without an earlier image.
         loss: loss of the images, without their noise.
         steps: number of the run's steps.
-        residuals: differences of K >= 2 independent images from the references, (K, N, 3).
-        references, weights, sizes: see `misfit`.
     """
     if not compares(problem):
         return None
     step, fall = change.get("step", 0), change.get("loss", (None, None))
     still = None not in fall and stays(loss, step, *fall)
-    of = residuals[0::2], residuals[1::2], references, weights, sizes
-    differs = misfit(*of, least_difference(step) if still else _OF_PICTURE_FALLING, by_pixel=True)
+    differs = misfit(residuals, least_difference(step) if still else _OF_PICTURE_FALLING, by_pixel=True)
     if differs is None:
         return None
     found = unexplained(problem, differs, step, steps, still)
@@ -169,9 +160,7 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
 
 def of_best(difference: Misfit, pictures: FreshPictures, best: Picture) -> Misfit | None:
     """Return a difference of the end with the size of that of better parameters, which the result holds; None if these have none."""
-    residuals, weights = pictures.differences(best.images), pictures.weights_of(best.images)
-    of = residuals[0::2], residuals[1::2], pictures.references, weights, pictures.sizes
-    found = misfit(*of, _OF_PICTURE)
+    found = misfit(pictures.compare(best.images), _OF_PICTURE)
     return found and replace(found, explanation=difference.explanation, causes=difference.causes)
 
 
@@ -180,10 +169,8 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
 
     Both images have the same random numbers. Averages over steps would lower the loss without progress, so neither is of averages.
     """
-    residuals, pictures = last.residuals, last.pictures
-    weights = pictures.weights_of(last.picture.images)
-    of = residuals, residuals, pictures.references, weights, pictures.sizes
-    differs = misfit(*of, _OF_PICTURE_FALLING) if compares(problem) else None
+    residuals = last.residuals
+    differs = misfit(residuals, _OF_PICTURE_FALLING, residuals) if compares(problem) else None
     if differs is None:
         return None
     value, error = last.change(earlier, _FALLS)

@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.display import formatting
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.estimators.penalties import penalty
 from unrender.runs.determination import changed
 from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
@@ -23,11 +24,10 @@ from unrender.runs.verification import (
     as_few_samples,
     compares,
     misfit,
-    residuals_of_views,
     without_prior,
 )
 from unrender.scene.problem import Problem
-from unrender.statistics.paired_losses import mean_square, slices_of_images
+from unrender.statistics.paired_losses import slices_of_images
 
 _ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
 """Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
@@ -164,11 +164,11 @@ def differs_still(
         return None
     loss, _ = loss_of_halves(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
-    of = residuals_of_views(problem, views, ends)
-    difference = no_improvement(problem, change, loss, result.steps, *of)
+    residuals = Residuals.of(problem, views, ends)
+    difference = no_improvement(problem, residuals, change, loss, result.steps)
     if difference or not compares(problem) or falls(loss, *change.get("loss", (None, None))):
         return difference
-    return as_few_samples(*of, spp / 2, change.get("step", 0) < FIRST_CANDIDATE)
+    return as_few_samples(residuals, spp / 2, change.get("step", 0) < FIRST_CANDIDATE)
 
 
 def with_misfit(result: Result, difference: Misfit | None) -> Result:
@@ -218,34 +218,34 @@ def unexplained_pixels(
     views = range(len(problem.views))
     if not renderings_of_check(problem) or len(ends) < len(views) or len(ends[0]) < 2:
         return None
-    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
+    residuals = Residuals.of(problem, views, ends)
 
     def change(values: Mapping[str, np.ndarray]) -> np.ndarray:
         return _joined(problem, [picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])
 
     signs = np.random.default_rng(_SEED)
     random = change({key: changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()})
-    weights = weights * np.isfinite(random).all(axis=1)
-    little = _is_little(residuals[0] + references, np.where(weights[:, None] > 0, random, 0.0), weights)
+    residuals = replace(residuals, weights=residuals.weights * np.isfinite(random).all(axis=1))
+    weights, sizes = residuals.weights, residuals.sizes
+    first = residuals.images[0] + residuals.references
+    little = _is_little(first, np.where(weights[:, None] > 0, random, 0.0), weights)
     # Changes do not cancel where no path meets an unknown, such as in a dark background beside an object.
     little &= (_around(little, sizes) >= _OF_AROUND) | ~random.any(axis=1)
     if np.count_nonzero(little * weights) < _FEWEST:
         return None
-    moved = [np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)]
-    explained = [_joined(problem, moved)]
+    explained = [_joined(problem, [np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
     explained += [change({**result, key: changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
     explained += map(change, _pulled(problem, result))
-    rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
+    rest = _without(residuals, explained)
     if moves := any(problem.renderer.parameters()[key].rigid for key in problem.unknowns):
-        little = little & _calm(rest.mean(axis=0), weights * little, sizes)
-    size, everywhere = (math.sqrt(mean_square(references, of)) for of in (weights * little, weights))
-    least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
-    differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, least)
-    cause, shared, sure = _as_if(rest, residuals + references, references, weights * little, sizes)
+        little = little & _calm(rest.images.mean(axis=0), weights * little, sizes)
+    rest, everywhere = replace(rest, weights=weights * little), residuals.size
+    least = _LEAST * max(1.0, everywhere / max(size := rest.size, 1e-300))
+    differs = misfit(rest, least)
+    cause, shared, sure = _as_if(rest, residuals.halves[1] + residuals.references)
     if differs is None and sure and shared > _LEAST_OF_CAUSE * least * size:
-        total = mean_square(rest.mean(axis=0), weights * little)
-        differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
-    total = math.sqrt(mean_square(residuals.mean(axis=0), weights))
+        differs = Misfit(shared, size, math.sqrt(max(rest.mean_square - shared**2, 0.0)))
+    total = math.sqrt(residuals.mean_square)
     if differs is None or (problem.has_prior and differs.share * everywhere < _MOSTLY * total):
         return None
     cause = cause if shared > _MOSTLY * differs.error else ""
@@ -294,13 +294,11 @@ def beyond_priors(
     if PRIOR not in difference.causes or STEPS in difference.causes or len(problem.unknowns) > _MOST_KEYS:
         return difference
     views = range(len(ends))
-    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
     explained = [
         _joined(problem, [picture(moved, view) - of[0] for view, of in zip(views, ends, strict=True)])
         for moved in _pulled(problem, values)
     ]
-    rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
-    left = misfit(rest[0::2], rest[1::2], references, weights, sizes, 0.0)
+    left = misfit(_without(Residuals.of(problem, views, ends), explained), 0.0)
     return difference if left is None or left.error < _MOSTLY * difference.error else without_prior(difference)
 
 
@@ -315,28 +313,22 @@ def _pulled(problem: Problem, values: Mapping[str, np.ndarray]) -> list[dict[str
     return moved
 
 
-def _as_if(
-    residuals: np.ndarray,
-    images: np.ndarray,
-    references: np.ndarray,
-    weights: np.ndarray,
-    sizes: Sequence[tuple[int, int]],
-) -> tuple[str, float, bool]:
+def _as_if(residuals: Residuals, images: np.ndarray) -> tuple[str, float, bool]:
     """Return what a view's reference looks like, the root mean square of the difference over all pixels, and whether that proves it.
 
     These are "" and 0 for nothing, and "" if another distortion explains nearly as much. The residual of the first half of the images is
-    fitted by changes of the second half, whose noise is independent of it. Rare bright samples leave most pixels too dark, so another
-    brightness proves nothing, nor does a fit below the noise of a half in the same pixels.
+    fitted by changes of `images`, (N, 3), the mean of the second half, whose noise is independent of it. Rare bright samples leave most
+    pixels too dark, so another brightness proves nothing, nor does a fit below the noise of a half in the same pixels.
     """
-    cause, shared, sure, total = "", 0.0, False, max(float(weights.sum()) * 3, 1e-300)
-    one, other = residuals[0::2].mean(axis=0), residuals[1::2].mean(axis=0)
+    cause, shared, sure, total = "", 0.0, False, max(float(residuals.weights.sum()) * 3, 1e-300)
+    references, sizes = residuals.references, residuals.sizes
     for view, part in enumerate(slices_of_images(sizes)):
-        root = np.sqrt(weights[part])[:, None]
+        root = np.sqrt(residuals.weights[part])[:, None]
         if np.count_nonzero(root) < _FEWEST:
             continue
-        wanted, again = (np.ravel(half[part] * root) for half in (one, other))
+        wanted, again = (np.ravel(half[part] * root) for half in residuals.halves)
         noise, best, explained = np.square(wanted - again) / 2.0, "", {}
-        image, reference = (x.reshape(*sizes[view], 3) for x in (images[1::2, part].mean(axis=0), references[part]))
+        image, reference = (x.reshape(*sizes[view], 3) for x in (images[part], references[part]))
         for index, (words, changes) in enumerate(distortions(image, reference).items()):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
@@ -357,7 +349,7 @@ def _as_if(
 
 
 def _joined(problem: Problem, pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the pixels (N, 3) of pictures of all views, in the units of `residuals_of_views`."""
+    """Return the pixels (N, 3) of pictures of all views, in the units of `Residuals.of`."""
     pairs = zip(pictures, problem.units, strict=True)
     return np.concatenate([np.reshape(picture, (-1, 3)) * unit for picture, unit in pairs]).astype(np.float64)
 
@@ -376,13 +368,14 @@ def _is_little(image: np.ndarray, change: np.ndarray, weights: np.ndarray) -> np
     return changes <= min(_LITTLE * usual, _OF_PIXEL)
 
 
-def _projection(residual: np.ndarray, changes: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
-    """Return the combination of changes (N, 3) that is closest to a residual (N, 3), with coefficients of each channel."""
-    roots, closest = np.sqrt(weights), np.zeros_like(residual)
-    for channel in range(residual.shape[1]):
+def _without(residuals: Residuals, changes: Sequence[np.ndarray]) -> Residuals:
+    """Return residuals without the combination of changes (N, 3) that is closest to their mean, with coefficients of each channel."""
+    roots, mean = np.sqrt(residuals.weights), residuals.images.mean(axis=0)
+    closest = np.zeros_like(mean)
+    for channel in range(mean.shape[1]):
         columns = np.stack([change[:, channel] for change in changes], axis=1)
-        finite = np.isfinite(columns).all(axis=1) & np.isfinite(residual[:, channel])
-        used = (roots * finite)[:, None] * np.where(finite[:, None], columns, 0.0)
-        wanted = roots * finite * np.where(finite, residual[:, channel], 0.0)
-        closest[:, channel] = np.where(finite[:, None], columns, 0.0) @ np.linalg.lstsq(used, wanted, rcond=1e-8)[0]
-    return closest
+        used = np.asarray(np.isfinite(columns).all(axis=1))
+        columns = np.where(used[:, None], columns, 0.0)
+        wanted = roots * used * mean[:, channel]
+        closest[:, channel] = columns @ np.linalg.lstsq(roots[:, None] * columns, wanted, rcond=1e-8)[0]
+    return replace(residuals, images=residuals.images - closest)

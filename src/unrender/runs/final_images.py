@@ -38,7 +38,7 @@ from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pi
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.reference_distortions import AS_IF
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, Misfit, misfit_of_views
+from unrender.runs.verification import DIFFERS, SMOOTH, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -172,8 +172,11 @@ def render_final_images(
 
 
 def _named_once(lines: Sequence[str], differs: Misfit | None) -> list[str]:
-    """Return lines without those about a distortion of the references, if the difference names one."""
-    return [line for line in lines if not (differs and AS_IF in differs.line and AS_IF in line)]
+    """Return lines without those that a difference makes superfluous: about a smooth difference, or a distortion of the references if it
+    names one."""
+    if differs is None or differs.of_samples:  # such noise explains no smooth difference
+        return [*lines]
+    return [line for line in lines if SMOOTH not in line and not (AS_IF in differs.line and AS_IF in line)]
 
 
 def _left_out(problem: Problem, result: Result) -> tuple[list[str], dict[str, np.ndarray]]:

@@ -19,8 +19,8 @@ from unrender.display import formatting
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
-from unrender.runs.reference_distortions import distortion_of_fit, unexplained_share
-from unrender.runs.verification import compares
+from unrender.runs.reference_distortions import distortion_of_fit
+from unrender.runs.verification import SMOOTH, compares, unexplained_share
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
@@ -371,7 +371,7 @@ def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, unsettled: bool
     first = "give more steps or another start, then " * unsettled
     if moved:
         return f"{line}{fit.distortion}, which would move {listed(moved)}; {first}check the references and the camera"
-    line += f"by {100.0 * fit.unexplained:.2g} % in a pattern that neither noise nor these numbers explain; {first}check what is not among "
+    line += f"by {100.0 * fit.unexplained:.2g} % {SMOOTH}; {first}check what is not among "
     return f"{line}the unknowns, such as lights, the camera and the tone curve" if fit.unexplained else ""
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from unrender.estimators.fresh_pictures import Residuals
 from unrender.runs.determination import changed
 from unrender.runs.result import Result
-from unrender.runs.verification import compares, misfit, residuals_of_views
+from unrender.runs.verification import compares, misfit
 from unrender.scene.problem import Problem
 
 _ERRORS = 2.0
@@ -45,21 +47,21 @@ def no_better_maps(
     judged = compares(problem) and result.verification.get("best") == "end" and len(ends[0]) > 1
     for key in keys if judged else ():
         state, views = {**result.parameters, key: result.initial[key]}, range(len(ends))
-        of = [
-            residuals_of_views(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
-        ]
-        first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
-        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * float(np.square(of[0][1]).mean(axis=1) @ of[0][2])
-        start, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
+        start, end = (
+            Residuals.of(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
+        )
+        first, last = start.products, end.products
+        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * start.size**2 * float(start.weights.sum())
+        noise, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
         share, is_mesh = 1.0 - float(last.sum()) / max(left, 1e-300), key in problem.faces
         explained = share * left > max(fall, (_OF_MESH if is_mesh else _EXPLAINED) * left)
-        if explained or not left > max(start, least):
+        if explained or not left > max(noise, least):
             continue
         remains = math.sqrt(max(1.0 - share, 0.0))
         if is_mesh:
-            may = misfit(of[1][0][0::2], of[1][0][1::2], *of[1][1:], 0.0, by_pixel=True) is not None
+            may = misfit(end, 0.0, by_pixel=True) is not None
         else:
-            may = _may_explain(problem, result.parameters, key, of[1], pictures)
+            may = _may_explain(problem, result.parameters, key, end, pictures)
         if may:
             closer = "hardly" if share < _EXPLAINED else f"{1.0 - remains:.0%}"
             lines.append(
@@ -78,7 +80,7 @@ def _may_explain(
     problem: Problem,
     values: Mapping[str, np.ndarray],
     key: str,
-    residuals_of: tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]],
+    residuals: Residuals,
     pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
 ) -> bool:
     """Return whether another map may explain the residuals: pictures change with it as the residuals do, or hardly change at all.
@@ -86,15 +88,15 @@ def _may_explain(
     The products of a residual that some map removes and of changes of the pictures by random changes of the map have a sum that is not 0,
     or pixels that are three apart share their sign. Noise of the references is independent of these changes, from pixel to pixel.
     """
-    residuals, _, weights, sizes = residuals_of
+    weights, sizes = residuals.weights, residuals.sizes
     generator, most, shown = np.random.default_rng(0), 0.0, False
     for blocks in _BLOCKS:
         signs = _signs(np.shape(values[key]), blocks, generator)
         state = {**values, key: changed(problem, key, np.asarray(values[key]), signs)}
         views = range(len(sizes))
-        after, _, finite, _ = residuals_of_views(problem, views, [pictures(state, view) for view in views])
-        change = (after - residuals) * (finite > 0)[:, None]
-        (one, other), (first, second) = ((x[0::2].mean(axis=0), x[1::2].mean(axis=0)) for x in (residuals, change))
+        after = Residuals.of(problem, views, [pictures(state, view) for view in views])
+        change = replace(after, images=(after.images - residuals.images) * (after.weights > 0)[:, None])
+        (one, other), (first, second) = residuals.halves, change.halves
         along, square = (x.sum(axis=1) * weights for x in (one * second + other * first, first * second))
         most = max(most, abs(_score(along)), _score(_pairs(along, sizes)))
         shown |= float(square.sum()) > _ERRORS * math.sqrt(float(np.square(square - square.mean()).sum()))

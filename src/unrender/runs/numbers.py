@@ -233,8 +233,7 @@ class Numbers:
         for view in self.views:
             request = SampleRequest(self.problem.views[view].sensor, self.spp, key.fold(view).uint32())
             images = arrays.numpy(session.image_batch(batch, request)).astype(np.float64)
-            roots = self.roots(view)
-            parts.append(np.where(roots > 0.0, images.reshape(count, -1, 3), 0.0) * roots)
+            parts.append(self.weighted(view, images))
             timing.add(self.spp * (images.size // 3))
         return np.concatenate(parts, axis=1)
 
@@ -246,9 +245,13 @@ class Numbers:
 
     def references(self) -> np.ndarray:
         """Return the references (P, 3) with the roots of the pixels' weights."""
-        of = [self.problem.views[view].reference for view in self.views]
-        flat = [np.asarray(x, np.float64).reshape(-1, 3) * self.roots(v) for x, v in zip(of, self.views, strict=True)]
-        return np.concatenate(flat)
+        of = [np.asarray(self.problem.views[view].reference, np.float64)[None] for view in self.views]
+        return np.concatenate([self.weighted(view, x)[0] for view, x in zip(self.views, of, strict=True)])
+
+    def weighted(self, view: int, pictures: np.ndarray) -> np.ndarray:
+        """Return pictures (B, H, W, 3) of a view times the roots of its pixels' weights, (B, P, 3); 0 where these are 0."""
+        roots = self.roots(view)
+        return np.where(roots > 0.0, pictures.reshape(len(pictures), -1, 3), 0.0) * roots
 
     def roots(self, view: int) -> np.ndarray:
         """Return the roots of the weights of a view's pixels, (P, 3), or (P, 1) if its channels have equal weights.

@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.display import formatting
 from unrender.statistics import scores
-from unrender.statistics.paired_losses import SIGNIFICANT, in_blocks, mean_square, slices_of_images
+from unrender.statistics.paired_losses import slices_of_images
 
 if TYPE_CHECKING:
     from unrender.runs.numbers import Numbers
@@ -19,8 +19,6 @@ AS_IF = "as if the reference of view"
 """Words before a view and what its reference looks like."""
 _EQUAL, _PLATEAU = 1e-3, 16
 """Relative difference of values that count as equal, and fewest values equal to the largest of a reference that is saturated."""
-_LEAST_SHARE = 1e-3
-"""Smallest size of a difference after a fit, relative to the references: rounding to 8 bits has about this size."""
 _SURE, _OWN, _LEAST_SIDE = 6.0, 0.05, 8
 """Standard errors of an amount from which a distortion is seen; share of its change of the picture that the unknowns must leave; fewest
 pixels of the shorter side of a picture."""
@@ -51,23 +49,6 @@ def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.n
             f"were turned by {abs(math.degrees(by[0])):.2g}° {'counterclockwise' if by[0] < 0.0 else 'clockwise'}"
         ): [x[..., None] * down - y[..., None] * along],
     }
-
-
-def unexplained_share(numbers: Numbers, slopes: np.ndarray, inverse: np.ndarray) -> float:
-    """Return the size of what a least-squares fit leaves of the final pictures' residual, relative to the references; 0 where noise or
-    other unknowns than the numbers may explain it. For the arguments, see `distortion_of_fit`."""
-    if not numbers.ends or len(numbers.keys) < len(numbers.problem.unknowns):
-        return 0.0
-    ends = np.concatenate([np.mean(numbers.ends[v], axis=0).reshape(-1, 3) * numbers.roots(v) for v in numbers.views])
-    ends = ends - numbers.references()
-    finite = np.asarray(np.isfinite(ends).all(axis=1))
-    ends = np.where(finite[:, None], ends, 0.0)
-    left = ends - np.tensordot(inverse @ np.tensordot(slopes, ends, axes=2), slopes, axes=1)
-    counted = finite & np.concatenate([numbers.roots(view).any(axis=1) for view in numbers.views])
-    size = math.sqrt(max(mean_square(numbers.references(), counted), 1e-300))
-    shared = in_blocks(left, counted, [numbers.problem.sizes[view] for view in numbers.views], _LEAST_SHARE * size)
-    share = math.sqrt(max(shared.mean_square, 0.0)) / size
-    return share if shared.score > SIGNIFICANT and share > _LEAST_SHARE else 0.0
 
 
 def distortion_of_fit(

@@ -218,9 +218,7 @@ class OtherStart(Callback):
         if problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
         state.other_start, values = _KEPT, run.full()
-        images = pictures.picture(values).images
-        of = pictures.differences(images), pictures.references, pictures.weights_of(images), pictures.sizes
-        if not misfit_of_numbers(problem, *of):
+        if not misfit_of_numbers(problem, pictures.compare(pictures.picture(values).images)):
             return
         keys, known = run.plan.other_starts, problem.renderer.parameters()
         lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]

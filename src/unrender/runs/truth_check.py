@@ -146,11 +146,10 @@ def _noise_of_pixels(pictures: FreshPictures, truth: Mapping[str, np.ndarray]) -
 
     It is the residual at the truth without what neighbours share, such as the difference of a wrong model or of exchanged references.
     """
-    images = pictures.images(truth)
-    residuals, total = pictures.differences(images), pictures.residual(images)
-    shared = misfit(residuals[0::2], residuals[1::2], pictures.references, pictures.weights, pictures.sizes, 0.0)
-    variance = total if shared is None else max(total - shared.error**2, 0.0)
-    mean, used = np.nan_to_num(residuals.mean(axis=0), posinf=0.0, neginf=0.0), pictures.weights > 0
+    residuals = pictures.compare(pictures.images(truth))
+    shared = misfit(residuals, 0.0)
+    variance = max(residuals.mean_square - (shared.error**2 if shared else 0.0), 0.0)
+    mean, used = residuals.images.mean(axis=0), residuals.weights > 0
     unshared = (mean[1::2] - mean[:-1:2])[used[1::2] & used[:-1:2]]
     squares = float(np.square(unshared).sum())
     products = 0.5 * (float(np.square(unshared.sum(axis=1)).sum()) - squares)

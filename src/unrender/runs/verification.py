@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
-from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.estimators.fresh_pictures import FreshPictures, Picture, Residuals
 from unrender.losses import FunctionLoss
 from unrender.methods.rules.starts import exchangeable_lights
 from unrender.runs.folder.schema import MISFIT
@@ -20,8 +20,13 @@ from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
+if TYPE_CHECKING:
+    from unrender.runs.numbers import Numbers
+
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
+SMOOTH = "in a pattern that neither noise nor these numbers explain"
+"""Words about the difference of `unexplained_share`."""
 STEPS, STEPS_OF_FEW, PRIOR, NOISE = "steps", "steps of few", "prior", "noise"
 """Values of `Misfit.causes` that may explain a difference of a right scene: too few steps, surely or if there were few; a prior; noise."""
 LOST = "lost"
@@ -40,6 +45,8 @@ one in few pixels."""
 _SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 """Samples per pixel of references up to which a difference as large as their noise is reported, and its smallest size relative to the
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
+_LEAST_SHARE = 1e-3
+"""Smallest size of a difference after a fit of numbers, relative to the references: rounding to 8 bits has about this size."""
 _ROWS, _PAIRS = (3, 1), (1, 0)  # layouts for `paired_losses.systematic` of rows of pixels, and of pairs of a sample
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
@@ -101,35 +108,29 @@ class Misfit:
 
 
 def misfit(
-    residuals: np.ndarray,
-    others: np.ndarray,
-    references: np.ndarray,
-    weights: np.ndarray,
-    sizes: Sequence[tuple[int, int]],
+    residuals: Residuals,
     least: float,
-    halves: tuple[np.ndarray, np.ndarray] | None = None,
+    earlier: Residuals | None = None,
+    repeated: Residuals | None = None,
     by_pixel: bool = False,
 ) -> Misfit | None:
     """Return the difference from the references that two pictures share; None if it may be noise or is small.
 
-    Noise of the references does not count, since neighbouring pixels do not share it, nor do pixels where an image is not finite.
+    Noise of the references does not count, since neighbouring pixels do not share it.
 
     Args:
-        residuals: differences of K independent images from the references, (K, N, 3), in an order that mostly keeps neighbours adjacent.
-        others: those of another picture, whose noise may depend on the first one's at the same pixel, (K, N, 3).
-        references: references, (N, 3).
-        weights: weight of each pixel, (N,), in [0, 1].
-        sizes: (height, width) of the images; () for a sample of pairs, see `paired_losses.nearby`.
+        residuals: those of K independent images, whose halves are the two pictures.
         least: smallest difference relative to the references.
-        halves: differences of K >= 2 images each at the end, with independent noise, (K, N, 3). With these, few pixels are also judged
-            one by one.
-        by_pixel: whether many pixels are, too. Without halves, only a difference that few of them hold counts.
+        earlier: those of the second picture, whose noise may depend on the first one's at the same pixel; the first is then the mean of
+            all images.
+        repeated: those of K >= 4 images at the end. With these, few pixels are also judged one by one.
+        by_pixel: whether many pixels are, too. Without `repeated`, only a difference that few of them hold counts.
     """
-    every = [residuals, others, *(halves or ())]
-    weights = weights * np.logical_and.reduce([np.isfinite(x).all(axis=(0, 2)) for x in every])
-    residuals, others, *parts = (np.where(weights[:, None] > 0, x, 0.0) for x in every)
-    one, other = residuals.mean(axis=0), others.mean(axis=0)
-    size, total = (math.sqrt(paired_losses.mean_square(x, weights)) for x in (references, one))
+    for others in filter(None, (earlier, repeated)):
+        residuals = replace(residuals, weights=residuals.weights * (others.weights > 0))
+    one, other = (x.images.mean(axis=0) for x in (residuals, earlier)) if earlier else residuals.halves
+    weights, sizes, size = residuals.weights, residuals.sizes, residuals.size
+    total = math.sqrt(paired_losses.mean_square(one, weights))
 
     def significant(
         shared: paired_losses.SystematicDifference, smallest: float, one_by_one: bool, place: str = ""
@@ -146,8 +147,10 @@ def misfit(
     if difference is None:
         line, place = paired_losses.at_border(one, other, weights, sizes)
         difference = significant(line, least, False, place)
-    if difference is None and halves is not None and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
-        difference = significant(paired_losses.repeated(parts[0], parts[1], weights), _OF_FEW, True)
+    if difference is None and repeated and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
+        difference = significant(
+            paired_losses.repeated(repeated.images[0::2], repeated.images[1::2], weights), _OF_FEW, True
+        )
     if difference is None and by_pixel:
         concentrated = paired_losses.concentrated(one, other, weights, sizes)
         difference = significant(concentrated, max(least, _OF_CONCENTRATED), True)
@@ -156,10 +159,7 @@ def misfit(
 
 def misfit_of_numbers(
     problem: Problem,
-    residuals: np.ndarray,
-    references: np.ndarray,
-    weights: np.ndarray,
-    sizes: Sequence[tuple[int, int]],
+    residuals: Residuals,
     known: Misfit | None = None,
     improved: bool = True,
     at_truth: Callable[[], float] | None = None,
@@ -171,10 +171,7 @@ def misfit_of_numbers(
 
     Args:
         problem: problem with the unknowns.
-        residuals: differences of K independent images from the references, (K, N, 3); K < 2 gives None.
-        references: references, (N, 3).
-        weights: weight of each pixel, (N,), in [0, 1].
-        sizes: see `misfit`.
+        residuals: those of K independent images; K < 2 gives None.
         known: difference that the run has found, which is returned.
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
@@ -184,13 +181,12 @@ def misfit_of_numbers(
     infos = [problem.renderer.parameters()[key] for key in problem.shapes()]
     lights = all(info.rigid and info.light for info in infos)
     few = sum(math.prod(info.shape) for info in infos) <= _FEW_NUMBERS
-    if not (few or lights) or len(residuals) < 2:
+    if not (few or lights) or len(residuals.images) < 2:
         return None
     if known is not None:
         return known
-    one, other = residuals[0::2], residuals[1::2]
-    halves = None if improved or len(residuals) < 4 else (one, other)
-    difference = misfit(one, other, references, weights, sizes, _OF_PICTURE, halves, by_pixel=True)
+    repeated = None if improved or len(residuals.images) < 4 else residuals
+    difference = misfit(residuals, _OF_PICTURE, None, repeated, by_pixel=True)
     if difference is None or difference.is_references_noise(at_truth):
         return None
     noise = "noise does not explain:"
@@ -206,28 +202,20 @@ def misfit_of_numbers(
     return replace(difference, explanation=explanation, causes=causes)
 
 
-def as_few_samples(
-    residuals: np.ndarray,
-    references: np.ndarray,
-    weights: np.ndarray,
-    sizes: Sequence[tuple[int, int]],
-    spp: float,
-    short: bool,
-) -> Misfit | None:
+def as_few_samples(residuals: Residuals, spp: float, short: bool) -> Misfit | None:
     """Return a difference as large as the noise of references with few samples per pixel; None if theirs would have many.
 
     Noise of n samples has 1/n of the variance of one sample, in every pixel. Other differences exceed it most in the half of the pixels
     with less noise. The noise of a pixel's neighbours orders them, because that is independent of the pixel's own. A pattern is no noise.
 
     Args:
-        residuals: differences of two independent images from the references, (2, N, 3).
-        references, weights, sizes: see `misfit`.
+        residuals: those of two independent images.
         spp: samples per pixel of each image.
         short: whether the run has so few steps that its difference may still fall.
     """
     from scipy.ndimage import uniform_filter  # takes long to import
 
-    one, other = residuals
+    weights, sizes, (one, other) = residuals.weights, residuals.sizes, residuals.halves
     products, variances = weights * (one * other).sum(axis=1), weights * np.square(one - other).sum(axis=1) * (spp / 2)
     images = [variances[x].reshape(size) for x, size in zip(paired_losses.slices_of_images(sizes), sizes, strict=True)]
     around = np.concatenate([np.ravel(9.0 * uniform_filter(image, 3) - image) for image in images])
@@ -236,40 +224,41 @@ def as_few_samples(
     shared, parts = float(products[quiet].sum()), (products[quiet], products[used])
     clear = all(float(x.sum()) > _SHARED * math.sqrt(float(x @ x)) for x in parts)
     error = math.sqrt(max(float(products.sum()), 0.0) / max(3.0 * float(weights.sum()), 1e-300))
-    size = math.sqrt(paired_losses.mean_square(references, weights))
     count = float(variances[quiet].sum()) / max(shared, 1e-300)
-    large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * size
+    large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * residuals.size
     if not (large and clear and count < _SAMPLES):
         return None
     words = f"as the noise of references with {count:.2g} samples per pixel would: if they have several times as many,"
     if pattern := paired_losses.has_pattern(one, other, weights, sizes):
         words = "in a pattern that noise lacks:"
     words += " the run needs more steps or another start, or light, depth, alignment or something that is not among the unknowns is wrong"
-    return Misfit(error, size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE), of_samples=not pattern)
+    return Misfit(
+        error, residuals.size, 0.0, True, f", {words}", (STEPS,) if pattern else (STEPS, NOISE), of_samples=not pattern
+    )
 
 
 def misfit_of_views(
     problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]], known: Misfit | None = None
 ) -> Misfit | None:
     """Return `misfit_of_numbers` of independent images (H, W, 3) of each of some views."""
-    return misfit_of_numbers(problem, *residuals_of_views(problem, views, images), known)
+    return misfit_of_numbers(problem, Residuals.of(problem, views, images), known)
 
 
-def residuals_of_views(
-    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views.
-
-    Pixels where an image is not finite have residual and weight 0. Views of AOVs beside others are in the unit of colours.
-    """
-    references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
-    weights = np.concatenate([problem.test_weights(*of).ravel() for of in zip(views, images, strict=True)])
-    pixels = np.concatenate([image.reshape(-1, 3) for image in references])
-    residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
-    sizes = [(height, width) for height, width, _ in map(np.shape, references)]
-    finite = np.isfinite(residuals.sum(axis=(0, 2)))
-    units = np.repeat(np.array(problem.units, np.float32)[list(views)], [math.prod(of) for of in sizes])[:, None]
-    return np.where(finite[:, None], residuals * units, 0.0), pixels * units, weights * finite, sizes
+def unexplained_share(numbers: Numbers, slopes: np.ndarray, inverse: np.ndarray) -> float:
+    """Return the size of what a least-squares fit leaves of the final pictures' residual, relative to the references; 0 where noise or
+    other unknowns than the numbers may explain it. For the arguments, see `distortion_of_fit`."""
+    if not numbers.ends or len(numbers.keys) < len(numbers.problem.unknowns):
+        return 0.0
+    references = numbers.references()
+    ends = [numbers.weighted(view, np.mean(numbers.ends[view], axis=0)[None])[0] for view in numbers.views]
+    roots = np.concatenate([numbers.roots(view).any(axis=1) for view in numbers.views])
+    sizes = [numbers.problem.sizes[view] for view in numbers.views]
+    of = Residuals(np.concatenate(ends)[None] - references, references, roots, sizes)
+    left = of.images[0] - np.tensordot(inverse @ np.tensordot(slopes, of.images[0], axes=2), slopes, axes=1)
+    size = max(of.size, 1e-150)
+    shared = paired_losses.in_blocks(left, of.weights > 0, sizes, _LEAST_SHARE * size)
+    share = math.sqrt(max(shared.mean_square, 0.0)) / size
+    return share if shared.score > paired_losses.SIGNIFICANT and share > _LEAST_SHARE else 0.0
 
 
 def compares(problem: Problem) -> bool:

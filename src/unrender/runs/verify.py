@@ -235,9 +235,9 @@ class Verify(Callback):
             larger = self._larger_pictures(run, pictures, 1, 0, seconds)
             self._larger = larger and (larger, larger.picture(result.parameters))
         larger, end = self._larger or (pictures, last)
-        of = larger.differences(end.images), larger.references, larger.weights_of(end.images), larger.sizes
+        of = run.problem, larger.compare(end.images)
         fall = change.get("change", {}), end.loss[0], result.steps
-        differs = misfit_of_numbers(run.problem, *of) or no_improvement(run.problem, *fall, *of)
+        differs = misfit_of_numbers(*of) or no_improvement(*of, *fall)
         return differs if differs and (self._larger or differs.share > _LARGE) else None
 
     def _larger_pictures(
@@ -283,11 +283,9 @@ class Verify(Callback):
             return not_converged(problem, last, earlier), change
         if averages:
             last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
-        own = small.references, small.weights_of(last.picture.images), small.sizes
-        differences = pictures.differences(end.images)
         # A sample of pixels has others than the images of earlier steps.
-        halves = None if pictures.sampled or small.sampled else (differences[0::2], differences[1::2])
-        difference = misfit(last.residuals, earlier.residuals, *own, least_difference(earlier.step), halves)
+        repeated = None if pictures.sampled or small.sampled else pictures.compare(end.images)
+        difference = misfit(last.residuals, least_difference(earlier.step), earlier.residuals, repeated)
         if difference is None or difference.is_references_noise(_at_truth(problem, small)):
             return None, change
         return unexplained(problem, difference, earlier.step, result.steps), change
@@ -309,10 +307,7 @@ def _misfit_of_numbers(
     """Return `misfit_of_numbers` of the image of the end."""
     return misfit_of_numbers(
         problem,
-        pictures.differences(last.images),
-        pictures.references,
-        pictures.weights_of(last.images),
-        pictures.sizes,
+        pictures.compare(last.images),
         improved=_is_worse(pictures, last, first),
         at_truth=_at_truth(problem, pictures),
     )
@@ -321,7 +316,11 @@ def _misfit_of_numbers(
 def _at_truth(problem: Problem, pictures: FreshPictures) -> Callable[[], float] | None:
     """Return the function of `Misfit.is_references_noise`; None unless the true values of all unknowns are known."""
     truth = problem.truth
-    return (lambda: pictures.residual(pictures.images(truth))) if truth.keys() == problem.unknowns.keys() else None
+    return (
+        (lambda: pictures.compare(pictures.images(truth)).mean_square)
+        if truth.keys() == problem.unknowns.keys()
+        else None
+    )
 
 
 def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:
