@@ -130,7 +130,8 @@ def test_what_it_is_called_with() -> None:
     ("loss", "message"),
     [
         (lambda image, reference: image - reference, r"with Dr.Jit's tensors: it returns TensorXf of shape \(4, 4, 3\), exp"),
-        (lambda image, reference: 3.0, "it returns float, expected a scalar"),
+        (lambda image, reference: 3.0, "it returns float, expected a scalar of Dr.Jit"),
+        (lambda image, reference: dr.mean(dr.detach(image)), "detached from it$"),
         (lambda image, reference: dr.mean(dr.detach(image), axis=None), "does not depend on the image, or is detached from it"),
         (lambda image, reference: dr.mean(image, axis=None) * dr.nan, "its value at an image that is nearly the reference is nan"),
         (lambda image, reference: image.nonsense(), "has no attribute 'nonsense'"),

@@ -313,6 +313,12 @@ def test_an_invalid_budget_is_refused(steps: Any, seconds: Any, message: str) ->
         budget.check_budget(steps, seconds)
 
 
+def test_numbers_of_numpy_are_a_budget() -> None:
+    parts = ur.PathGradient(spp=2), ur.optimizers.Adam(0.01)
+    result = ur.optimize(problem(), *parts, steps=np.int64(3), seconds=np.float32(60))  # pyright: ignore[reportArgumentType]
+    assert result.steps == 3
+
+
 def test_slowdown_is_at_least_one() -> None:
     assert 1.0 <= budget.slowdown() < 1e3
 

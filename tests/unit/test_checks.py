@@ -51,6 +51,7 @@ def test_numbers_of_numpy_become_pythons() -> None:
         ("damping", 0.0, "damping must be a finite number > 0 and < 1, got 0.0"),
         ("seed", -1, "seed must be a whole number of at least 0, got -1"),
         ("count", None, "count must be a whole number of at least 1, got None"),
+        ("count", [0] * 99, f"count must be a whole number of at least 1, got [{'0, ' * 11}0 ... {'0, ' * 5}0, 0]"),
         ("pair", 1, "pair must be a whole number of at least 2, got 1"),
         ("flag", 1, "flag must be true or false, got 1"),
         ("kind", np.zeros(2), 'kind must be "a", "b" or "c", got array([0., 0.])'),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 import time
 
+import drjit as dr
 import pytest
+from drjit.llvm.ad import Float
 
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
@@ -79,3 +81,25 @@ def test_an_error_ends_the_turn() -> None:
     thread.start()
     thread.join()
     assert found == ["done"]
+
+
+def test_the_callers_suspended_gradients_stay_outside() -> None:
+    """A run within `dr.suspend_grad()` had gradients of 0 and ended as finished, with its start as the result."""
+
+    @exclusive("estimate")
+    def slope() -> float:
+        x = Float(3.0)
+        dr.enable_grad(x)
+        dr.backward(x * x)
+        return dr.grad(x)[0]
+
+    with dr.suspend_grad():
+        assert slope() == 6.0
+        assert not dr.grad_enabled(_enabled())
+    assert slope() == 6.0
+
+
+def _enabled() -> Float:
+    x = Float(3.0)
+    dr.enable_grad(x)
+    return x * x

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
 import pytest
+from drjit.llvm.ad import Array3f
 
 from tests.analytic import AnalyticRenderer
 from unrender import losses
@@ -71,6 +73,7 @@ def test_takes_the_scenes_own_values_and_physical_bounds_by_default():
         ("wall.value", np.float64(0.25), [0.25] * 3),
         ("floor.data", 0.25, np.full((2, 2, 3), 0.25)),
         ("floor.data", (0.1, 0.2, 0.3), np.tile([0.1, 0.2, 0.3], (2, 2, 1))),
+        ("floor.data", Array3f(0.5, 0.25, 0.125), np.tile([0.5, 0.25, 0.125], (2, 2, 1))),
         ("floor.data", np.arange(12).reshape(2, 2, 3) / 12, np.arange(12).reshape(2, 2, 3) / 12),
         ("lamp.scale", 3, 3.0),
         ("lamp.scale", [3.0], 3.0),
@@ -139,8 +142,9 @@ def test_of_many_values_outside_the_bounds_the_furthest_is_named() -> None:
 
 @pytest.mark.parametrize(
     ("bounds", "kept"),
-    [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None))],
-)
+    [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None)),
+     (np.array([0.0, 2.5]), (0.0, 2.5)), ((np.float32(0), np.int64(2)), (0.0, 2.0)), ((-1e300, 1e300), (None, None))],
+)  # fmt: skip
 def test_given_bounds_replace_the_physical_ones(bounds: Any, kept: Any):
     assert problem([Parameter("wall.value", bounds=bounds)]).unknowns["wall.value"].bounds == kept
 
@@ -423,3 +427,23 @@ def test_pixel_weights_are_the_mask_or_ones(size: tuple[int, int] | None) -> Non
     np.testing.assert_array_equal(View(reference).pixel_weights(size), np.ones((HEIGHT, WIDTH)))
     np.testing.assert_array_equal(View(reference, mask=mask).pixel_weights(size), mask)
     assert View(reference).pixel_weights(HEIGHT * WIDTH).shape == (HEIGHT * WIDTH,)
+
+
+def test_tensors_of_pytorch_may_require_gradients() -> None:
+    torch = pytest.importorskip("torch")
+    value = torch.full((3,), 0.25, requires_grad=True)
+    picture = torch.full((HEIGHT, WIDTH, 3), 0.25, requires_grad=True)
+    made = problem([Parameter("wall.value", value)], [View(picture)], truth={"wall.value": value})
+    assert made.initial_values()["wall.value"].tolist() == made.truth["wall.value"].tolist() == [0.25, 0.25, 0.25]
+    assert np.asarray(made.views[0].reference).tolist() == np.full((HEIGHT, WIDTH, 3), 0.25).tolist()
+
+
+def test_a_deep_copy_is_the_problem_itself() -> None:
+    made = problem([Parameter("wall.value")])
+    assert copy.deepcopy({"problem": made})["problem"] is made
+
+
+def test_parameters_of_arrays_can_be_compared() -> None:
+    made = Parameter("wall.value", initial=np.ones(3))
+    assert made == made
+    assert made != Parameter("wall.value", initial=np.ones(3))

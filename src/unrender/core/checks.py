@@ -14,7 +14,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, printable
+from unrender.core.text import did_you_mean, printable, shorten
 
 Positive = Annotated[float, 0.0]
 """Annotation of a field: a finite number > 0."""
@@ -39,7 +39,9 @@ def number(
         return number
     limits = [f"{'>=' if inclusive else '>'} {above:g}"] if above > -math.inf else []
     limits += [f"< {below:g}"] if below < math.inf else []
-    raise InputError(f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {value!r}")
+    raise InputError(
+        f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {shorten(repr(value), 60)}"
+    )
 
 
 def limits(low: float | None, high: float | None) -> list[str]:
@@ -51,7 +53,7 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
     """Return `value` as an integer >= `at_least`, else raise `InputError`."""
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return int(value)
-    raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")
+    raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {shorten(repr(value), 60)}")
 
 
 def flag(owner: str, name: str, value: Any) -> None:
@@ -155,9 +157,14 @@ class DropReport:
             _log.warning("%s; %d of %d so far were dropped", reason, self.count, self.total)
 
 
-def refuse_masked(value: Any, advice: str) -> None:
-    """Raise `InputError` with advice for a NumPy array of which some elements are masked: as an array they are values like others."""
+def array_like(value: Any, advice: str) -> Any:
+    """Return a value for `numpy.asarray`, which refuses tensors of PyTorch that require gradients.
+
+    Raises `InputError` with advice for a NumPy array of which some elements are masked: as an array they are values like others.
+    """
     import numpy as np  # a command that only says its version does without
 
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"a masked array has values that do not count: {advice}")
+    detach = getattr(value, "detach", None)
+    return value if detach is None else detach()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -38,7 +39,7 @@ def exclusive(what: str, long: bool = False) -> Iterator[None]:
     """Serialise calls from different threads, as a decorator or in a `with` statement. Calls within one thread may nest.
 
     A call waits for the other thread's call to end. It raises `InputError` instead if the other call is marked `long`: it may take hours,
-    as a run does.
+    as a run does. The caller's `dr.suspend_grad()` does not apply within: gradients would be 0.
     """
     me = threading.current_thread()
     with _turn.changed:
@@ -52,7 +53,9 @@ def exclusive(what: str, long: bool = False) -> Iterator[None]:
         _turn.thread = me
         _turn.doing.append((what, long))
     try:
-        yield
+        # Before the import of Dr.Jit nothing can be suspended.
+        with sys.modules["drjit"].resume_grad() if "drjit" in sys.modules else contextlib.nullcontext():
+            yield
     finally:
         with _turn.changed:
             _turn.doing.pop()

@@ -74,7 +74,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         return replace(picture, notice=f"{path.name}: {picture.notice}" if picture.notice else "")
-    checks.refuse_masked(source, "fill it, and give mask = ~numpy.ma.getmaskarray(image)[..., 0] to the view")
+    source = checks.array_like(source, "fill it, and give mask = ~numpy.ma.getmaskarray(image)[..., 0] to the view")
     try:
         array = np.asarray(source)
     except (TypeError, ValueError) as error:

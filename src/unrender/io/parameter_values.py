@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import checks, periodic
+from unrender.core import arrays, checks, periodic
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, resampling, volumes
 
@@ -89,7 +89,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
             raise InputError(f"{path}: no such file; expected a number, a colour, or a picture or grid file")
         values, notice = _from_file(path, shape, conversion)
         return periodic.repeat(conversion.stored(values), conversion.repeated), notice
-    checks.refuse_masked(initial, "fill it")
+    initial = checks.array_like(initial, "fill it")
     try:
         array = np.asarray(initial)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
@@ -104,6 +104,8 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         raise InputError("must be finite, got NaN or infinite values")
     if array.size > 3 and not conversion.takes_number and not np.ptp(array):
         raise InputError(f"expected different values, got {array.flat[0]:g} for all")
+    if array.shape != shape and array.shape[1:] == (1,) and arrays.is_drjit(initial):  # a vector such as mi.Color3f
+        array = array[:, 0]
     if array.shape == shape:
         return periodic.repeat(array, conversion.repeated), ""
     if array.shape == conversion.picture_shape(shape):

@@ -83,23 +83,30 @@ class FunctionLoss:
         return _each(lambda one, other: self._evaluate(one, other, True)[1] * elements, image, reference)
 
     def _detect_framework(self, reference: np.ndarray) -> Backend:
-        failures, image = [], reference * reference.dtype.type(0.9) + reference.dtype.type(0.05)
+        failures: list[tuple[bool, str]] = []  # whether the function returned, and what is wrong
+        image = reference * reference.dtype.type(0.9) + reference.dtype.type(0.05)
         frameworks: tuple[Backend, ...] = ("drjit", "torch")
         for framework in frameworks:
             try:
                 value, _ = _CALLS[framework](self, image, reference, True)
             except Exception as error:  # a user's function may raise anything for another framework's arrays
-                failures.append(f"with {_NAMES[framework]}'s tensors: {reason_of(error, 160)}")
+                line = f"with {_NAMES[framework]}'s tensors: {reason_of(error, 160)}"
+                failures.append((isinstance(error, InputError), line))
                 continue
             if not np.isfinite(value):
                 raise InputError(f"{self!r}: its value at an image that is nearly the reference is {value}")
             return framework
-        raise InputError(f"{self!r}: expected a function from an image (H, W, 3) to a scalar; {'; '.join(failures)}")
+        # What it raises for the other framework's tensors says nothing.
+        lines = [line for returned, line in failures if returned] or [line for _, line in failures]
+        raise InputError(f"{self!r}: expected a function from an image (H, W, 3) to a scalar; {'; '.join(lines)}")
 
     def _evaluate(self, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
         if "_framework" not in self.__dict__:
             self.prepare(arrays.numpy(reference))
-        return _CALLS[self.__dict__["_framework"]](self, image, reference, derivative)
+        try:
+            return _CALLS[self.__dict__["_framework"]](self, image, reference, derivative)
+        except InputError as error:
+            raise InputError(f"loss: {self!r}: {error}") from error
 
 
 def _each(of_one: Callable[[Array, Array], Array], images: Array, references: Array) -> Array:
@@ -127,7 +134,7 @@ def _with_drjit(loss: FunctionLoss, image: Array, reference: Array, derivative: 
             or dr.width(result) != 1
             or (dr.depth_v(result) > 1 and not dr.is_tensor_v(result))
         ):
-            raise InputError(f"it returns {_described(result)}, expected a scalar")
+            raise InputError(f"it returns {_described(result)}, expected a scalar of Dr.Jit")
         if derivative:
             if not dr.grad_enabled(result):
                 raise InputError("its result does not depend on the image, or is detached from it")
@@ -145,12 +152,12 @@ def _detached(x: Array, kind: Any) -> Any:
 def _with_torch(loss: FunctionLoss, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
     torch: Any = sys.modules.get("torch")
     if torch is None:  # a function that uses PyTorch has imported it
-        raise InputError("PyTorch is not imported")
+        raise ImportError("PyTorch is not imported")
     tensor = torch.from_numpy(arrays.numpy(image)).requires_grad_(derivative)
     with torch.set_grad_enabled(derivative):
         result = loss.function(tensor, *([torch.from_numpy(arrays.numpy(reference))] if loss.takes_reference else []))
     if not isinstance(result, torch.Tensor) or result.numel() != 1:
-        raise InputError(f"it returns {_described(result)}, expected a scalar")
+        raise InputError(f"it returns {_described(result)}, expected a scalar of PyTorch")
     if not derivative:
         return float(result), image
     if not result.requires_grad:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unrender.backend import cache
-from unrender.core import timing
+from unrender.core import checks, timing
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.optimizers.averaged_newton import AveragedNewton
@@ -199,8 +199,8 @@ def check_budget(steps: int | None, seconds: float | None) -> None:
         raise InputError("optimize: set a budget, steps= or seconds=")
     if isinstance(steps, int) and steps >= _MOST_STEPS:
         raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
-    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
-        raise InputError(f"optimize: steps must be a whole number of at least 1, got {steps!r}")
+    if steps is not None:
+        checks.integer("optimize", "steps", steps, at_least=1)
     if seconds is not None and (
         isinstance(seconds, bool) or not isinstance(seconds, Real) or not 0 < seconds < math.inf
     ):

@@ -54,6 +54,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; remove it, because a search adapts its own covariance"
             )
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
+    steps, seconds = None if steps is None else int(steps), None if seconds is None else float(seconds)
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {}, state)
     run.warnings += remarks(plan.problem, plan.optimizer)
     initialize(run, 0)

@@ -20,7 +20,7 @@ INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 not finite."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Result:
     """Result of `optimize`.
 

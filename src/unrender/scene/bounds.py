@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
-from unrender.core.text import listed
+from unrender.core.text import listed, shorten
 from unrender.core.trees import Tree
 from unrender.parameterisations import Bounds
 from unrender.rendering.renderer import ParameterInfo
@@ -29,6 +30,7 @@ _HALF_PRECISION = 2.0**-11  # largest relative change of a value that is rounded
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
+_LARGEST = float(np.finfo(np.float32).max)
 _FULL_TURN = 2.0 * math.pi + 1e-4  # largest angle in radians that is plausible, with a margin for rounding
 
 
@@ -204,18 +206,24 @@ def _off_ends(x: Array, low: float | None, high: float | None) -> Array:
 
 
 def _read(bounds: Any) -> Bounds:
+    bounds = bounds.tolist() if hasattr(bounds, "tolist") else bounds  # an array
     if isinstance(bounds, (str, bytes)) or not isinstance(bounds, Sequence) or len(bounds) != 2:
-        raise InputError(f"expected (low, high), either may be None, got {bounds!r}")
+        raise InputError(f"expected (low, high), either may be None, got {shorten(repr(bounds), 60)}")
     for side in bounds:
-        if side is not None and (isinstance(side, bool) or not isinstance(side, (int, float)) or math.isnan(side)):
-            raise InputError(f"expected two numbers or None, got {side!r}")
-    low, high = (None if side is None else float(side) for side in bounds)
+        if side is not None and (isinstance(side, bool) or not isinstance(side, Real) or math.isnan(float(side))):
+            raise InputError(f"expected two numbers or None, got {shorten(repr(side), 60)}")
+    low, high = (None if side is None else _single(float(side)) for side in bounds)
     if low == math.inf or high == -math.inf:
         raise InputError(f"low must be less than high, got {low} and {high}")
     low, high = None if low == -math.inf else low, None if high == math.inf else high
     if low is not None and high is not None and low >= high:
         raise InputError(f"low must be less than high, got {low:g} and {high:g}")
     return low, high
+
+
+def _single(side: float) -> float:
+    """Return a bound, infinite beyond the range of single precision, in which the values are."""
+    return side if abs(side) <= _LARGEST else math.copysign(math.inf, side)
 
 
 def _below(low: float | None, high: float | None) -> bool:

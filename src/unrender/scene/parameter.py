@@ -29,7 +29,7 @@ from unrender.scene.surfaces import Surface, surface_error
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Parameter:
     """A scene parameter to recover.
 

@@ -86,8 +86,7 @@ class Problem(ViewLosses):
         loss, max_depth, name: as above.
         origin: how to recreate the problem: {"scene": path of the XML}, plus "file", the path of the problem file, if there is one;
             {"gallery": name, "options": {...}}; empty if only the program that made it can recreate it.
-        notices: one line for each ignored setting of the scene, and for each change of the input, such as a conversion or clamping to
-            bounds.
+        notices: one line for each ignored setting of the scene, and for each change of the input, such as a conversion.
         references: values and weights of single pixels of the references.
         executor: executor of gradient requests, in this process unless the views are distributed.
         remeshed_from: the problem with its initial meshes, if this one has been remeshed; else None.
@@ -144,7 +143,7 @@ class Problem(ViewLosses):
             views=checked_views,
             original_views=original_views,
             loss=checked_loss,
-            max_depth=max_depth or longest_path(renderer),
+            max_depth=int(max_depth or longest_path(renderer)),
             name=name or (path.stem if path else "problem"),
             origin={"scene": str(path.resolve())} if path and is_storable(renderer, original_views) else {},
             notices=[
@@ -229,6 +228,9 @@ class Problem(ViewLosses):
     def texture_coordinates(self, key: str) -> np.ndarray | None:
         """Return the texture coordinates (V, 2) of the mesh whose vertex positions are the parameter `key`; None if it has none."""
         return texture_coordinates(self.renderer, key, self.unknowns[key].initial.size)
+
+    def __deepcopy__(self, memo: Any) -> Problem:
+        return self  # it does not change, and Mitsuba does not copy scenes
 
     def __repr__(self) -> str:
         return notebook.line(self)

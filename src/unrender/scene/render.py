@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unrender.core import arrays, timing
+from unrender.core import arrays, checks, timing
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
@@ -45,8 +45,7 @@ def render(
     Raises:
         InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes.
     """
-    if not isinstance(spp, int) or spp < 1:
-        raise InputError(f"render: spp must be a whole number of at least 1, got {spp!r}")
+    spp = checks.integer("render", "spp", spp, at_least=1)
     if not 0 <= view < len(problem.views):
         raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
     point = as_tree(problem, parameters)

@@ -152,7 +152,7 @@ def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
 def _is_of_film(source: Any) -> bool:
     """Return whether the values are in the film's format, with no colour space of their own."""
     path = isinstance(source, (str, Path))
-    integers = not path and np.asarray(source).dtype in (np.uint8, np.uint16)
+    integers = not path and getattr(source, "dtype", None) in (np.uint8, np.uint16)
     return not integers and (not path or Path(source).suffix.lower() == ".npy")
 
 

@@ -30,7 +30,7 @@ from unrender.app.evaluation.measures import (
 from unrender.app.exporting.asset import read_environment
 from unrender.app.stages import stages_file
 from unrender.backend import variant
-from unrender.core import arrays, phases
+from unrender.core import arrays, checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
@@ -103,8 +103,7 @@ def judge(
         InputError: no result, no held-out problem, a scene without the parameters of the run, or `out` cannot be written.
     """
     variant.ensure()
-    if not isinstance(spp, int) or spp < 1:
-        raise InputError(f"judge: spp must be a whole number of at least 1, got {spp!r}")
+    spp = checks.integer("judge", "spp", spp, at_least=1)
     place = Path(run) / "judge" if out is None else Path(out)
     files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
     light = None if environment is None else scenes.read_light(Path(environment))
