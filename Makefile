@@ -29,11 +29,15 @@ SECONDS := 30
 WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
 PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=2
 TYPES = $(BIN)/pyright --pythonpath $(BIN)/python
-# Types of the sources take half a minute of one core: they are checked beside the tests, and told after them. `make lint` checks all types.
+# Types of the sources take half a minute of one core: they are checked beside the tests, told after them, and checked again only if a source or
+# the installed packages have changed. `make lint` checks all types.
+CHECKED := .pytest_cache/types-checked
+SOURCES = { ls $(BIN)/../lib/*/site-packages; find src -name '*.py' | LC_ALL=C sort | xargs cksum pyproject.toml; } | cksum
 define WITH_LINT
 	$(BIN)/ruff check .
 	@mkdir -p .pytest_cache
-	@$(TYPES) src > .pytest_cache/types.txt 2>&1 & types=$$!; \
+	@( sources=$$($(SOURCES)); if [ "$$sources" = "$$(cat $(CHECKED) 2>/dev/null)" ]; then echo "types of the sources: unchanged since the last check"; \
+	   elif $(TYPES) src; then echo "$$sources" > $(CHECKED); else exit 1; fi ) > .pytest_cache/types.txt 2>&1 & types=$$!; \
 	$(PYTEST) $(1); tests=$$?; \
 	wait $$types; types=$$?; cat .pytest_cache/types.txt; exit $$((tests + types))
 endef
@@ -61,7 +65,7 @@ asset: .venv/ready
 	@echo "held-out photographs beside renders: file://$(CURDIR)/out/asset/judge/sheet.png; the asset: out/asset/export"
 
 test: .venv/ready
-	$(call WITH_LINT,-m "not slow")
+	$(call WITH_LINT,-m "not slow" -o faulthandler_timeout=150)
 
 test-all: .venv/ready
 	$(call WITH_LINT,)
@@ -74,7 +78,8 @@ test-unit: .venv/ready
 
 lint: .venv/ready
 	$(BIN)/ruff check .
-	$(TYPES)
+	@mkdir -p .pytest_cache
+	sources=$$($(SOURCES)); $(TYPES) && echo "$$sources" > $(CHECKED)
 
 docs: .venv/docs-ready
 	$(BIN)/python -m sphinx -W --keep-going -E -c scripts/site -b html docs build/site

@@ -26,6 +26,8 @@ KERNELS = "DRJIT_CACHE_DIR"
 SCENES = [0]
 """Number of scenes that this process has loaded."""
 
+# Threads of BLAS that wait for one another beside other processes take a hundred times the processor time of a small system of equations.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Every process of the run shares one folder, the commands that tests start too. `make clean` empties it.
 os.environ.setdefault(KERNELS, str(HERE.parent / ".pytest_cache" / "kernels"))
 os.makedirs(os.environ[KERNELS], exist_ok=True)
@@ -54,6 +56,27 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
     if SCENES[0] != before or ("mitsuba" in sys.modules and time.process_time() - start > 0.5):
         gc.collect()
     return result
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Run no test again in which its process ended, such as one over the limit of time: with `--dist loadfile`, pytest-xdist hands it to
+    the next process, until `--max-worker-restart` ends the whole run."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Once(LoadFileScheduling):
+        def remove_node(self, node: Any) -> str | None:
+            waiting = [
+                (tests, name) for tests in self.assigned_work[node].values() for name in tests if not tests[name]
+            ]
+            if not waiting:
+                return super().remove_node(node)
+            tests, ended = waiting[0]
+            tests[ended] = True
+            super().remove_node(node)
+            return ended
+
+    return Once(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 def pytest_collection_finish() -> None:

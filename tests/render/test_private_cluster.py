@@ -14,11 +14,19 @@ from typing import Any
 
 import pytest
 
-ray = pytest.importorskip("ray")
+from unrender.app.distributed.cluster import Workers, connect
+from unrender.app.distributed.cluster.private import private_cluster, private_folder
+from unrender.core.errors import InputError
 
-from unrender.app.distributed.cluster import Workers, connect  # noqa: E402
-from unrender.app.distributed.cluster.private import private_cluster, private_folder  # noqa: E402
-from unrender.core.errors import InputError  # noqa: E402
+ray: Any = None
+
+
+@pytest.fixture(autouse=True, scope="module")
+def with_ray() -> None:
+    """Import the extra here, not at collection: every test process would take a second for it."""
+    global ray
+    ray = pytest.importorskip("ray")
+
 
 STRANGER = Path(__file__).with_name("stranger_of_ray.py")
 NOBODY = 65534

@@ -13,8 +13,15 @@ from scipy import stats
 import unrender as ur
 from tiers import slow
 
-# An extra, of gigabytes on some systems, which `make test` does not install.
-torch: Any = pytest.importorskip("torch")
+torch: Any = None
+
+
+@pytest.fixture(autouse=True, scope="module")
+def with_torch() -> None:
+    """Import the extra, which `make test` does not install, not at collection: every test process would take seconds for it."""
+    global torch
+    torch = pytest.importorskip("torch")
+
 
 N = 3
 SIGMA = np.array([0.4, 0.6, 0.5])

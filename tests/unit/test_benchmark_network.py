@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-torch: Any = pytest.importorskip("torch")
-
-from benchmarks.rcv.fig10_perceptual import train  # noqa: E402
-from unrender import losses  # noqa: E402
+from benchmarks.rcv.fig10_perceptual import train
+from unrender import losses
 
 PICTURES = functools.cache(train.pictures)
 """Decoded once for all tests."""
+
+
+@pytest.fixture(autouse=True)
+def torch() -> Any:
+    """Import the extra for these tests, not at collection: every test process would take seconds for it."""
+    return pytest.importorskip("torch")
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +28,7 @@ def pictures_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_weights_at_every_call_that_the_loss_takes(tmp_path: Path) -> None:
+def test_the_same_weights_at_every_call_that_the_loss_takes(tmp_path: Path, torch: Any) -> None:
     files = [tmp_path / f"{number}.pth" for number in range(3)]
     for file, seed in zip(files, (0, 0, 1), strict=True):
         train.train(file, steps=2, batch=4, side=8, seed=seed)

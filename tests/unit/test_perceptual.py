@@ -16,7 +16,7 @@ from unrender import losses
 from unrender.core import tables
 from unrender.losses import perceptual
 
-torch: Any = pytest.importorskip("torch")
+torch: Any = None
 SIZES = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256)}
 """Inputs and outputs of the first convolutions, by their numbers in torchvision's vgg16().features."""
 DEEP = {17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}
@@ -24,7 +24,9 @@ DEEP = {17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_thread() -> Iterator[None]:
-    """Pictures this small are slower on several threads."""
+    """Pictures this small are slower on several threads. PyTorch is imported here, not at collection by every test process."""
+    global torch
+    torch = pytest.importorskip("torch")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
