@@ -31,102 +31,93 @@ class Gradient(Capability):
 
 
 @dataclass(frozen=True)
-class Variance(Capability):
-    """Variance of the gradient.
+class TreeCapability(Capability):
+    """A quantity with one value per element of the gradient.
 
     Attributes:
-        values: {key: array}, with the gradient's keys and shapes, >= 0.
+        values: {key: array}, with the gradient's keys and shapes.
     """
 
-    name: ClassVar[str] = "variance"
     values: Tree
 
 
 @dataclass(frozen=True)
-class FreshGradient(Capability):
+class MatrixCapability(Capability):
+    """A quantity with one value per pair of elements.
+
+    Attributes:
+        matrix: (n, n) over all parameters flattened in key order, symmetric.
+    """
+
+    matrix: Array
+
+
+@dataclass(frozen=True)
+class Variance(TreeCapability):
+    """Variance of the gradient, >= 0."""
+
+    name: ClassVar[str] = "variance"
+
+
+@dataclass(frozen=True)
+class FreshGradient(TreeCapability):
     """Gradient from this step's samples alone. Its noise has mean 0, independent of earlier samples.
 
     Estimators that reuse earlier samples provide it in some of their steps.
-
-    Attributes:
-        values: {key: array}, with the gradient's keys and shapes.
     """
 
     name: ClassVar[str] = "fresh_gradient"
-    values: Tree
 
 
 @dataclass(frozen=True)
-class GradientAtBounds(Capability):
+class GradientAtBounds(TreeCapability):
     """Gradient of this step's samples with respect to x, of an estimate with respect to v. It tells which elements stay at their bounds.
 
-    Attributes:
-        values: {key: array} of the parameters with bounds and a preconditioner, or of some of them.
+    It has values for the parameters with bounds and a preconditioner, or for some of them.
     """
 
     name: ClassVar[str] = "gradient_at_bounds"
-    values: Tree
 
 
 @dataclass(frozen=True)
-class NoiseSample(Capability):
-    """One sample of the gradient's noise, of mean 0 and about the gradient's variance.
-
-    Attributes:
-        values: {key: array}, with the gradient's keys and shapes.
-    """
+class NoiseSample(TreeCapability):
+    """One sample of the gradient's noise, of mean 0 and about the gradient's variance."""
 
     name: ClassVar[str] = "noise_sample"
-    values: Tree
 
 
 @dataclass(frozen=True)
-class Hessian(Capability):
-    """Hessian of the loss.
-
-    Attributes:
-        matrix: (n, n) over all parameters flattened in key order.
-    """
+class Hessian(MatrixCapability):
+    """Hessian of the loss."""
 
     name: ClassVar[str] = "hessian"
-    matrix: Array
 
 
 @dataclass(frozen=True)
-class HessianNoise(Capability):
-    """Noise that squared derivative images would add to the Gauss-Newton matrix.
+class HessianNoise(MatrixCapability):
+    """Noise that squared derivative images would add to the Gauss-Newton matrix: Σ ℓ'' N Nᵀ over pixels, with the noise N of the images.
 
-    Attributes:
-        matrix: (n, n), positive semidefinite: Σ ℓ'' N Nᵀ over pixels, with the noise N of the derivative images. Damping by it prevents
-            steps along noisy directions.
+    It is positive semidefinite. Damping by it prevents steps along noisy directions.
     """
 
     name: ClassVar[str] = "hessian_noise"
-    matrix: Array
 
 
 @dataclass(frozen=True)
-class GradientNoise(Capability):
-    """Covariance of the gradient from this step's samples. Trust-region steps are damped along directions that noise dominates.
-
-    Attributes:
-        matrix: (n, n), positive semidefinite.
-    """
+class GradientNoise(MatrixCapability):
+    """Covariance of the gradient from this step's samples. Trust-region steps are damped along directions that noise dominates."""
 
     name: ClassVar[str] = "gradient_noise"
-    matrix: Array
 
 
 @dataclass(frozen=True)
-class ScoreCovariance(Capability):
-    """Covariance of the loss gradient from the references' noise, as the residual shows it.
+class ScoreCovariance(MatrixCapability):
+    """Covariance of the loss gradient from the references' noise, as the residual shows it (`statistics.scores.covariance`).
 
-    Attributes:
-        matrix: (n, n), see `statistics.scores.covariance`; noise may give it negative eigenvalues.
+    Noise may give it negative eigenvalues.
     """
 
     name: ClassVar[str] = "score_covariance"
-    matrix: Array
 
 
 @dataclass(frozen=True)

@@ -93,10 +93,7 @@ class PathThenNewton:
         """Samples per pixel of the path gradients."""
         return self.path.spp
 
-    @property
-    def provides(self) -> Capabilities:
-        """A gradient, and a block after the change."""
-        return Capabilities(Gradient, BlockEstimate)
+    provides = Capabilities(Gradient, BlockEstimate)
 
     def pixel_weights(self, state: PathThenNewtonState) -> tuple[np.ndarray, ...]:
         return self.newton.pixel_weights(state.newton) if state.changed else ()

@@ -142,10 +142,7 @@ class AveragedNewton:
         check_rates("AveragedNewton", self.learning_rate, None)
         checks.fields(self)
 
-    @property
-    def requires(self) -> Capabilities:
-        """A gradient and its Hessian."""
-        return Capabilities(Gradient, Hessian)
+    requires = Capabilities(Gradient, Hessian)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AveragedNewtonState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter."""

@@ -91,10 +91,7 @@ class CMAES:
             checks.integer("CMAES", "population", self.population, at_least=4)
         checks.fields(self)
 
-    @property
-    def requires(self) -> Capabilities:
-        """The loss at points chosen by the optimizer."""
-        return Capabilities(LossFunction)
+    requires = Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
         own = rates_of("CMAES", parameters, self.learning_rate, learning_rates)

@@ -101,10 +101,7 @@ class Newton:
         check_options("Newton", self)
         checks.fields(self)
 
-    @property
-    def requires(self) -> Capabilities:
-        """A gradient and its Hessian."""
-        return Capabilities(Gradient, Hessian)
+    requires = Capabilities(Gradient, Hessian)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
         return init_state("Newton", self, parameters, learning_rates)
@@ -273,10 +270,7 @@ class LBFGS:
         check_options("LBFGS", self)
         checks.fields(self)
 
-    @property
-    def requires(self) -> Capabilities:
-        """A gradient."""
-        return Capabilities(Gradient)
+    requires = Capabilities(Gradient)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> LBFGSState:
         n = sum(math.prod(arrays.shape(x)) for x in parameters.values())

@@ -174,10 +174,7 @@ class Successive:
     first: Optimizer = field(default_factory=ScheduleFree)
     then: AveragedNewton = field(default_factory=AveragedNewton)
 
-    @property
-    def requires(self) -> Capabilities:
-        """A gradient, and a block."""
-        return Capabilities(Gradient, BlockEstimate)
+    requires = Capabilities(Gradient, BlockEstimate)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> SuccessiveState:
         """Return the state before the first step. Raises `InputError` as both optimizers do."""

@@ -149,7 +149,8 @@ class Verify(Callback):
         differs, change = self._residual(problem, result, pictures, last, unaveraged)
         differs = of_best(differs, pictures, places[best][0]) if differs and places else differs
         if result.standard_error and not (differs or places):
-            differs = _misfit_of_numbers(problem, pictures, result, first, last)
+            improved, truth = _is_worse(pictures, last, first), _at_truth(problem, pictures)
+            differs = misfit_of_numbers(problem, pictures.compare(last.images), improved=improved, at_truth=truth)
         if run.folder is None and not (differs or places):
             differs = self._by_more_paths(run, result, pictures, last, change, seconds)
         if differs:
@@ -299,18 +300,6 @@ def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Pic
         return result, last, last
     picture = pictures.picture(mean.parameters)
     return (result, last, last) if _is_worse(pictures, last, picture) else (mean, picture, last)
-
-
-def _misfit_of_numbers(
-    problem: Problem, pictures: FreshPictures, result: Result, first: Picture, last: Picture
-) -> Misfit | None:
-    """Return `misfit_of_numbers` of the image of the end."""
-    return misfit_of_numbers(
-        problem,
-        pictures.compare(last.images),
-        improved=_is_worse(pictures, last, first),
-        at_truth=_at_truth(problem, pictures),
-    )
 
 
 def _at_truth(problem: Problem, pictures: FreshPictures) -> Callable[[], float] | None:

@@ -115,9 +115,7 @@ class ScheduleFreeAverage(checks.Checked, StepTransform):
     beta: Fraction = 0.9
     averaging: NotNegative = 2.0
 
-    @property
-    def sets_steps(self) -> bool:
-        return True
+    sets_steps = True
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Iterates:
         return Iterates(dict(parameters), dict(parameters))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
@@ -107,15 +107,10 @@ class StepTransform(ABC):
     Subclasses are registered. `unrender.optimizers.Chain` applies transforms in sequence.
     """
 
-    @property
-    def requires(self) -> tuple[type[Capability], ...]:
-        """Capabilities that the estimate must have in addition to the gradient."""
-        return ()
-
-    @property
-    def sets_steps(self) -> bool:
-        """Return whether `update` sets `StepUpdate.steps`, which later transforms cannot change."""
-        return False
+    requires: ClassVar[tuple[type[Capability], ...]] = ()
+    """Capabilities that the estimate must have in addition to the gradient."""
+    sets_steps: ClassVar[bool] = False
+    """Whether `update` sets `StepUpdate.steps`, which later transforms cannot change."""
 
     @abstractmethod
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Any:

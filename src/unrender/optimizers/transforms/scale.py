@@ -10,7 +10,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.checks import Fraction, Positive
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.estimators.capabilities import Capability, Variance
+from unrender.estimators.capabilities import Variance
 from unrender.optimizers.transforms.base import (
     MEAN_SQUARES,
     SMOOTHING_UNCHANGED,
@@ -105,10 +105,7 @@ class ScaleByDeviation(checks.Checked, StepTransform):
 
     epsilon: Positive = 1e-24
 
-    @property
-    def requires(self) -> tuple[type[Capability], ...]:
-        """The variance."""
-        return (Variance,)
+    requires = (Variance,)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
         del parameters, learning_rates
