@@ -46,12 +46,7 @@ class Camera(fields.Rendered):
             "wall": parts.rectangle((0, 1.5, -1.6), (3, 0, 0), (0, 1.5, 0), wall),
             "tower": _block((-0.75, 0.6, -0.2), (0.2, 0.6, 0.2), 25.0, parts.diffuse(0.7, 0.25, 0.2)),
             "block": _block((0.65, 0.22, 0.5), (0.3, 0.22, 0.24), -35.0, parts.diffuse(0.25, 0.4, 0.7)),
-            "ball": {
-                "type": "sphere",
-                "center": [0.0, 0.34, -0.1],
-                "radius": 0.34,
-                "bsdf": parts.diffuse(0.8, 0.75, 0.6),
-            },
+            "ball": parts.sphere([0.0, 0.34, -0.1], 0.34, parts.diffuse(0.8, 0.75, 0.6)),
             "cone": meshes.sheet("cone", _cone(), parts.twosided(parts.diffuse(0.3, 0.65, 0.35)), closed=True),
         }
 

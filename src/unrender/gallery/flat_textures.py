@@ -191,12 +191,7 @@ def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any
     points = meshes.lathe(np.full(2, tube), np.array([0, length]), 48) + middle
     down = mi.ScalarTransform4f().translate((middle + [0, length, 0]).tolist()).rotate([1, 0, 0], 90)
     return {
-        "ball": {
-            "type": "sphere",
-            "center": middle.tolist(),
-            "radius": _RADIUS,
-            "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
-        },
+        "ball": parts.sphere(middle, _RADIUS, {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
         "tube": meshes.sheet("tube", points, parts.twosided(parts.diffuse(0.05)), closed=True),
         "lid": {
             "type": "disk",

@@ -243,12 +243,7 @@ class MirrorTrio(fields.Rendered):
             "frame": parts.rectangle(
                 (0.1, 0.95, -1.02), (0.56, 0, 0), (0, 0.46, 0.035), parts.diffuse(0.1, 0.06, 0.04)
             ),
-            "ball": {
-                "type": "sphere",
-                "center": [-0.78, 0.34, 0.1],
-                "radius": 0.34,
-                "bsdf": parts.diffuse(0.75, 0.12, 0.08),
-            },
+            "ball": parts.sphere([-0.78, 0.34, 0.1], 0.34, parts.diffuse(0.75, 0.12, 0.08)),
             "cone": meshes.sheet("cone", cone, parts.twosided(parts.diffuse(0.85, 0.6, 0.1)), closed=True),
             "block": {
                 "type": "cube",

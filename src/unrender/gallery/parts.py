@@ -61,6 +61,11 @@ def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], *
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix.tolist()), "bsdf": bsdf, **more}
 
 
+def sphere(centre: Vector, radius: float, bsdf: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Return a sphere."""
+    return {"type": "sphere", "center": [float(x) for x in centre], "radius": radius, "bsdf": bsdf, **more}
+
+
 def unit(vector: Vector) -> np.ndarray:
     """Return a vector of length 1."""
     return np.asarray(vector) / np.linalg.norm(vector)

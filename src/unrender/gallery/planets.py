@@ -79,12 +79,7 @@ def sky() -> dict[str, Any]:
 
 def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[str, Any]:
     """Return one side of a glass ball around (x, 0, 0), with these indices of refraction."""
-    return {
-        "type": "sphere",
-        "center": [x, 0.0, 0.0],
-        "radius": radius,
-        "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside},
-    }
+    return parts.sphere([x, 0.0, 0.0], radius, {"type": "dielectric", "int_ior": inside, "ext_ior": outside})
 
 
 def blue(resolution: int) -> np.ndarray:

@@ -47,12 +47,7 @@ class Shadow(fields.Rendered):
             | {"to_world": mi.ScalarTransform4f().look_at(list(above), [0, 0, 0], [0, 0, -1])},
             "sun": parts.sun(_SUN, 1.2),
             "floor": parts.rectangle((0, 0, 0), (6, 0, 0), (0, 0, -6), parts.diffuse(0.6, 0.5, 0.35)),
-            "ball": {
-                "type": "sphere",
-                "center": [float(x), _HEIGHT, float(z)],
-                "radius": _RADIUS,
-                "bsdf": parts.diffuse(0.5),
-            },
+            "ball": parts.sphere((x, _HEIGHT, z), _RADIUS, parts.diffuse(0.5)),
         }
 
     def parameters(self) -> tuple[Parameter, ...]:

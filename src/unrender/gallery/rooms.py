@@ -117,13 +117,7 @@ class Lamp(fields.Rendered):
             "front": parts.rectangle((0, 1.1, 2.6), (-1.6, 0, 0), (0, 1.1, 0), plaster),
             "floor": parts.rectangle((0, 0, 0.7), (1.6, 0, 0), (0, 0, -1.9), parts.diffuse(0.35, 0.25, 0.18)),
             "ceiling": parts.rectangle((0, 2.2, 0.7), (1.6, 0, 0), (0, 0, 1.9), plaster),
-            "bulb": {
-                "type": "sphere",
-                "center": list(_BULB),
-                "radius": 0.12,
-                "bsdf": parts.diffuse(0.0),
-                "emitter": parts.light(60.0, 45.0, 28.0),
-            },
+            "bulb": parts.sphere(_BULB, 0.12, parts.diffuse(0.0), emitter=parts.light(60.0, 45.0, 28.0)),
             "shade": meshes.sheet(
                 "shade", _shade_points(48), parts.twosided(parts.diffuse(0.6, 0.3, 0.2)), closed=True
             ),

@@ -185,8 +185,8 @@ def _toy() -> dict[str, Any]:
     red, blue, gold, green = ([0.75, 0.15, 0.1], [0.1, 0.25, 0.7], [0.8, 0.6, 0.15], [0.15, 0.55, 0.2])
     return {
         "base": {"type": "cube", "to_world": to.translate([0, -0.55, 0]).scale([0.6, 0.12, 0.6]), "bsdf": parts.diffuse(*blue)},
-        "body": {"type": "sphere", "center": [0.0, -0.1, 0.0], "radius": 0.36, "bsdf": parts.diffuse(*red)},
-        "head": {"type": "sphere", "center": [0.1, 0.4, 0.05], "radius": 0.22, "bsdf": parts.diffuse(*gold)},
+        "body": parts.sphere([0.0, -0.1, 0.0], 0.36, parts.diffuse(*red)),
+        "head": parts.sphere([0.1, 0.4, 0.05], 0.22, parts.diffuse(*gold)),
         "arm": {"type": "cube", "to_world": to.translate([-0.35, 0.05, 0.2]).rotate([0, 0, 1], 35).scale([0.3, 0.08, 0.08]),
                 "bsdf": parts.diffuse(*green)},
     }  # fmt: skip
@@ -199,12 +199,7 @@ def _balls(count: int) -> dict[str, Any]:
     reach = min(0.85, 0.98 - radius)
     centers, colours = random.uniform(-reach, reach, (count, 3)), random.uniform(0.08, 0.8, (count, 3))
     return {
-        f"ball_{n}": {
-            "type": "sphere",
-            "center": [float(x) for x in center],
-            "radius": radius,
-            "bsdf": parts.diffuse(*colour),
-        }
+        f"ball_{n}": parts.sphere(center, radius, parts.diffuse(*colour))
         for n, (center, colour) in enumerate(zip(centers, colours.tolist(), strict=True))
     }
 
@@ -255,7 +250,7 @@ class ThreeBodies(fields.Rendered):
 
 
 def _ball(x: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "sphere", "center": [x, 0.0, 0.0], "radius": 0.6, "bsdf": bsdf}
+    return parts.sphere([x, 0.0, 0.0], 0.6, bsdf)
 
 
 @register(name="tea", position=23)
@@ -281,12 +276,7 @@ class Tea(fields.Rendered):
             "sample_emitters": False,
         }
         room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
-        pot = {
-            "type": "sphere",
-            "center": [0.0, -0.5, 0.1],
-            "radius": 0.5,
-            "bsdf": {"type": "dielectric", "int_ior": 1.33},
-        }
+        pot = parts.sphere([0.0, -0.5, 0.1], 0.5, {"type": "dielectric", "int_ior": 1.33})
         return {
             "type": "scene",
             "camera": parts.camera((0, -0.1, 2.1), (0, -0.35, 0), 46.0, self.resolution),
