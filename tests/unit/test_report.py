@@ -6,6 +6,7 @@ import base64
 import hashlib
 import io
 import re
+import sys
 from typing import Any
 
 import numpy as np
@@ -134,6 +135,16 @@ def test_control_weight_is_the_mean_over_channels_from_0_to_1(tmp_path):
     shown = page.picture("View 0: control weight per pixel")
     low, middle, high = [68, 1, 84], [33, 145, 140], [253, 231, 37]  # viridis
     assert np.abs(shown.astype(int) - np.array([[low, high], [middle, low]])).max() <= 2
+
+
+@pytest.mark.parametrize("name", [tone_mapping.ERROR_COLORMAP, tone_mapping.VALUE_COLORMAP])
+def test_colour_maps_are_those_of_matplotlib_without_its_import(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib
+
+    expected = matplotlib.colormaps[name](np.arange(256))[:, :3]
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    values = 2.0 * np.arange(256) / 255.0 + 1.0
+    assert np.abs(tone_mapping.apply_colormap(values, 1.0, 3.0, name) - expected).max() < 1.2 / 255.0
 
 
 def test_error_pictures_of_start_and_result_share_one_scale(tmp_path):

@@ -19,6 +19,22 @@ ERROR_COLORMAP = "inferno"
 """Colour map of error images."""
 VALUE_COLORMAP = "viridis"
 """Colour map of weights and of one-channel parameters."""
+_COLORMAPS = {
+    name: np.frombuffer(bytes.fromhex(colours), np.uint8).reshape(-1, 3) / 255.0
+    for name, colours in {
+        ERROR_COLORMAP: (
+            "00000402020c0504170a072210092d160b391e0c45260c512f0a5b380962400a67490b6a510e6c59106e61136e69166e71196e78"
+            "1c6d801f6c88226a902568982766a02a63a82e5fb0315bb73557bf3952c63d4dcc4248d34743d94d3ddf5337e45a31e9612bed69"
+            "25f1711ff47918f78212f98b0bfa9407fb9d07fca60cfcb014fbba1ffac42af8cd37f6d746f4e156f2ea69f2f27df5f992fcffa4"
+        ),
+        VALUE_COLORMAP: (
+            "44015446085c471063481769481d6f482475472a7a46307e453781433d844142873f48893d4e8a3a538b38598c355e8d33638d31"
+            "688e2e6d8e2c718e2a768e297b8e27808e25848e23898e218e8d20928c1f978b1e9c891fa18821a58524aa8328ae802eb37c35b7"
+            "793dbc7446c06f50c46a5ac86465cb5e70cf577cd25089d54895d840a2da37b0dd2fbddf26cae11fd8e219e5e419f1e51dfde725"
+        ),
+    }.items()
+}
+"""Every fifth of the 256 colours of Matplotlib's maps. Its import would take a fifth of a page's time."""
 
 
 @dataclass(frozen=True)
@@ -119,12 +135,11 @@ class ColourBar:
 
 
 def apply_colormap(values: np.ndarray, low: float, high: float, name: str = VALUE_COLORMAP) -> np.ndarray:
-    """Map values from `low` to `high` to colours of the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
-    import matplotlib
-
-    span = high - low
+    """Map values from `low` to `high` to colours of the colour map `name`: (...) -> (..., 3) in [0, 1]."""
+    span, colours = high - low, _COLORMAPS[name]
     place = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (span if span > 0 else 1.0)
-    return matplotlib.colormaps[name](np.clip(place, 0.0, 1.0))[..., :3]
+    nodes = np.linspace(0.0, 1.0, len(colours))
+    return np.stack([np.interp(place, nodes, channel) for channel in colours.T], axis=-1)
 
 
 def error_bar(high: float) -> ColourBar:
@@ -134,9 +149,7 @@ def error_bar(high: float) -> ColourBar:
 
 def colour_bar(low: float, high: float, label: str, name: str = VALUE_COLORMAP) -> ColourBar:
     """Return the legend of a picture in a colour map from `low` to `high`."""
-    import matplotlib
-
-    stops = (matplotlib.colormaps[name](np.linspace(0.0, 1.0, 9))[:, :3] * 255 + 0.5).astype(int)
+    stops = (apply_colormap(np.linspace(0.0, 1.0, 9), 0.0, 1.0, name) * 255 + 0.5).astype(int)
     return ColourBar(tuple(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops), low, (low + high) / 2, high, label)
 
 
