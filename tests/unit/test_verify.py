@@ -832,6 +832,23 @@ def test_a_wrong_line_of_pixels_at_the_border_of_a_reference_is_told(place: str,
     assert bool(place) or found is None
 
 
+@pytest.mark.parametrize("local", [0.0, 0.4])
+def test_a_difference_has_its_largest_part(local: float) -> None:
+    """A tenth of the picture off everywhere, or beside a square that differs by four times as much."""
+    generator, side = np.random.default_rng(0), 64
+    wrong = np.full((side, side, 1), 0.1)
+    wrong[16:32, 40:56] += local
+    images = (wrong + generator.normal(0.0, 0.1, (4, side, side, 3))).reshape(4, -1, 3)
+    residuals = Residuals(images, np.ones((side**2, 3)), np.ones(side**2), [(side, side)])
+    found = verification.misfit(residuals, 0.01)
+    assert found is not None
+    assert found.largest == pytest.approx(
+        0.1 + local, abs=0.03
+    )  # the mean of a square has the noise 0.1 / 8 / 2 in each channel
+    assert ("up to 0.5" in found.line) is (local > 0.0)
+    assert Residuals(images, residuals.references, residuals.weights, []).largest == 0.0
+
+
 def brighter(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """A picture twice as bright."""
     return 2.0 * light + generator.normal(0.0, 0.01, light.shape)

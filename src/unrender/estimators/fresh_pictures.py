@@ -32,6 +32,7 @@ _FEW_PIXELS, _FEW_OF_VIEWS = 1 << 10, 1 << 12
 _TOGETHER, _FEWER = 16, 4
 """Number of states that share a launch in `FreshPictures.images_of`, since one number needs one recording; ratio of the samples of one
 image to those of each state, since places differ much."""
+_BLOCK = 8  # side in pixels of the squares of `Residuals.largest`
 _STREAM = 2  # stream of the run's key for new images; the steps use 0, the warm-up 1
 _MOST_NON_FINITE = 0.01
 """Fraction of pixels that may become non-finite, compared to the start, before an image counts as non-finite."""
@@ -102,6 +103,18 @@ class Residuals:
     def mean_square(self) -> float:
         """Mean square of the mean difference over pixels and channels."""
         return paired_losses.mean_square(self.images.mean(axis=0), self.weights)
+
+    @property
+    def largest(self) -> float:
+        """Root mean square of the mean difference of 8 x 8 pixels where it is largest, without the images' noise; 0 for pairs."""
+        most = 0.0
+        for part, (height, width) in zip(paired_losses.slices_of_images(self.sizes), self.sizes, strict=True):
+            rows, columns = height // _BLOCK, width // _BLOCK
+            halves = (np.reshape(x[part] * self.weights[part, None], (height, width, 3)) for x in self.halves)
+            inner = (x[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK, 3) for x in halves)
+            one, other = (x.mean(axis=(1, 3)) for x in inner)
+            most = max(most, float((one * other).mean(axis=2).max(initial=0.0)))
+        return math.sqrt(most)
 
     @property
     def products(self) -> np.ndarray:

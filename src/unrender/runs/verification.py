@@ -47,6 +47,8 @@ _SAMPLES, _OF_SAMPLES, _OF_SAMPLES_SHORT, _SHARED = 16.0, 0.03, 0.05, 3.5
 image; that in runs of less than about 100 steps; score of the product of two pictures' differences, which few pixels must not hold."""
 _LEAST_SHARE = 1e-3
 """Smallest size of a difference after a fit of numbers, relative to the references: rounding to 8 bits has about this size."""
+_FAR_ABOVE, _OF_NOISE = 1.5, 0.6
+"""Ratios to the error and to the noise from which a warning has the largest difference; 0.6 are five standard errors of 8 x 8 pixels."""
 _ROWS, _PAIRS = (3, 1), (1, 0)  # layouts for `paired_losses.systematic` of rows of pixels, and of pairs of a sample
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
@@ -68,6 +70,7 @@ class Misfit:
         causes: likely causes: `STEPS`, `STEPS_OF_FEW`, `PRIOR`, `NOISE`, `LOST`; () for something that is not among the unknowns.
         place: words about the pixels that hold it; "" for all.
         of_samples: whether it looks like the noise of few samples per pixel, which standard errors contain.
+        largest: see `Residuals.largest`; 0 if unknown.
     """
 
     error: float
@@ -78,6 +81,7 @@ class Misfit:
     causes: tuple[str, ...] = ()
     place: str = ""
     of_samples: bool = False
+    largest: float = 0.0
 
     @property
     def share(self) -> float:
@@ -100,10 +104,13 @@ class Misfit:
         return {"error": float(f"{self.error:.6g}"), "share": share, "causes": list(self.causes)}
 
     def describe(self) -> str:
-        """Return the first words of a warning, with the ratio to the noise where it is above 1."""
+        """Return the first words of a warning, with the ratio to the noise above 1, and the largest difference if it stands out."""
         times = f"{self.error / self.noise:.1f} times its noise" if 0.0 < self.noise < self.error else ""
         share = f"{self.share:.0%} of the picture" if self.size > 0.0 else ""
-        parts = f" ({', '.join(filter(None, (share, times)))})" * bool(share or times)
+        stands_out = self.largest > max(_FAR_ABOVE * self.error, _OF_NOISE * self.noise)
+        most = f"up to {formatting.number(self.largest)} over 8 x 8 pixels" * stands_out
+        known = ", ".join(filter(None, (share, times, most)))
+        parts = f" ({known})" * bool(known)
         return f"{DIFFERS} by {formatting.number(self.error)}{parts}{self.place}"
 
 
@@ -154,7 +161,7 @@ def misfit(
     if difference is None and by_pixel:
         concentrated = paired_losses.concentrated(one, other, weights, sizes)
         difference = significant(concentrated, max(least, _OF_CONCENTRATED), True)
-    return difference
+    return difference and replace(difference, largest=residuals.largest)
 
 
 def misfit_of_numbers(
