@@ -123,6 +123,11 @@ class Residuals:
         return (one * other).sum(axis=1) * self.weights
 
     @property
+    def shared(self) -> float:
+        """Mean square difference over pixels and channels without the images' noise, at least 0."""
+        return max(float(self.products.sum()) / max(3.0 * float(self.weights.sum()), 1e-300), 0.0)
+
+    @property
     def size(self) -> float:
         """Root mean square of the references."""
         return math.sqrt(paired_losses.mean_square(self.references, self.weights))

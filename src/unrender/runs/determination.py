@@ -325,7 +325,7 @@ def with_lost(
     if not keys or remeshed or len(ends[0]) < 2 or not compares(problem) or result.verification.get("best") != "end":
         return difference
     residuals = Residuals.of(problem, range(len(ends)), ends)
-    left = max(float(residuals.products.sum()) / max(3.0 * float(residuals.weights.sum()), 1e-300), 0.0)
+    left = residuals.shared
     start, end, lost, longest, spp = result.initial, result.parameters, [], 0.0, 4 * per_pass
     for key in keys:
         if remaining() <= longest:

@@ -223,14 +223,14 @@ def as_few_samples(residuals: Residuals, spp: float, short: bool) -> Misfit | No
     from scipy.ndimage import uniform_filter  # takes long to import
 
     weights, sizes, (one, other) = residuals.weights, residuals.sizes, residuals.halves
-    products, variances = weights * (one * other).sum(axis=1), weights * np.square(one - other).sum(axis=1) * (spp / 2)
+    products, variances = residuals.products, weights * np.square(one - other).sum(axis=1) * (spp / 2)
     images = [variances[x].reshape(size) for x, size in zip(paired_losses.slices_of_images(sizes), sizes, strict=True)]
     around = np.concatenate([np.ravel(9.0 * uniform_filter(image, 3) - image) for image in images])
     used = np.flatnonzero(weights)
     quiet = used[np.argsort(around[used])[: len(used) // 2]]
     shared, parts = float(products[quiet].sum()), (products[quiet], products[used])
     clear = all(float(x.sum()) > _SHARED * math.sqrt(float(x @ x)) for x in parts)
-    error = math.sqrt(max(float(products.sum()), 0.0) / max(3.0 * float(weights.sum()), 1e-300))
+    error = math.sqrt(residuals.shared)
     count = float(variances[quiet].sum()) / max(shared, 1e-300)
     large = error > (_OF_SAMPLES_SHORT if short else _OF_SAMPLES) * residuals.size
     if not (large and clear and count < _SAMPLES):
@@ -360,23 +360,14 @@ def compare_memory(
 
     `residual` is the image whose distance from the references serves as scale.
     """
-    weights = pictures.weights
-    means = np.concatenate([images.mean(axis=0) for images in fresh])
-    differences = np.concatenate(memory) - means
-    finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
-    if not np.isfinite(differences[finite]).all():
+    images = np.concatenate(fresh, axis=1)
+    own = Residuals(images, np.zeros(images.shape[1:]), pictures.weights, pictures.sizes)  # from a black picture
+    differences, counted = np.concatenate(memory) - own.images.mean(axis=0), own.weights > 0
+    if not np.isfinite(differences[counted]).all():
         return Memory(math.inf, 0.0, 0.0, math.inf)
-    shared = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
-    counted = (weights * finite)[:, None]
-
-    def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
-        joined = np.concatenate(images, axis=1)
-        one, other = joined[0::2].mean(axis=0) - subtracted, joined[1::2].mean(axis=0) - subtracted
-        products = np.where(np.isfinite(one * other), one * other, 0.0) * counted
-        return math.sqrt(max(float(products.sum()) / max(3 * float(counted.sum()), 1e-300), 0.0))
-
-    error = math.sqrt(max(shared.mean_square, 0.0))
-    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)
+    shared = paired_losses.systematic(np.where(counted[:, None], differences, 0.0), own.weights)
+    error, left = math.sqrt(max(shared.mean_square, 0.0)), pictures.compare(residual.images).shared
+    return Memory(error, math.sqrt(own.shared), math.sqrt(left), shared.score)
 
 
 @runtime_checkable
