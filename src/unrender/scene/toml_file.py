@@ -177,22 +177,16 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         raise FieldError(
             ("parameters", index, "key"), "missing, expected the name of a scene parameter, or several names as keys"
         )
-    preconditioner = None
-    if model.preconditioner is not None:
-        with FieldError.at(("parameters", index, "preconditioner")):
-            preconditioner = tables.component(model.preconditioner, "preconditioner", folder=folder)
-    resolutions = None
-    if model.coarse_to_fine is not None:
-        with FieldError.at(("parameters", index, "coarse_to_fine")):
-            resolutions = coarse_to_fine.of(model.coarse_to_fine)
-    start = _value(model.initial, folder)
-    fields = {
-        "parameterisation": model.parameterisation,
-        "regularizer": model.regularizer,
-        "remeshing": model.remeshing,
+    own = {name: value for name, value in model if name != "truth"}
+    conversions = {
+        "preconditioner": lambda value: tables.component(value, "preconditioner", folder=folder),
+        "coarse_to_fine": coarse_to_fine.of,
     }
-    fields |= {"prior": model.prior, "self_intersection": model.self_intersection, "keys": model.keys}
-    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, resolutions, **fields)
+    for name, convert in conversions.items():
+        if own[name] is not None:
+            with FieldError.at(("parameters", index, name)):
+                own[name] = convert(own[name])
+    return Parameter(**own | {"initial": _value(model.initial, folder)})
 
 
 def _value(value: Any, folder: Path) -> Any:
