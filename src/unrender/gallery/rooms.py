@@ -267,10 +267,7 @@ class PlainAndTextured(fields.Rendered):
 
     def scene(self) -> dict[str, Any]:
         """Return the room of `parts.room` with a lamp in its ceiling, and bin and cushion on its floor y = -1."""
-        cover = {
-            "type": "diffuse",
-            "reflectance": parts.bitmap(parts.photograph("chelsea", self.texture_resolution)),
-        }
+        cover = {"type": "diffuse", "reflectance": parts.bitmap(parts.photograph("chelsea", self.texture_resolution))}
         place = np.array([-0.46, -1.0, -0.3])
         return {
             "type": "scene",

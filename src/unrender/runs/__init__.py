@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from unrender.runs.map_uncertainty import uncertainty
 
 __getattr__, _ = lazy.attach(
-    __name__,
-    {"Live": "live", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"},
+    __name__, {"Live": "live", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"}
 )
 __all__ = ["Live", "sensitivity", "uncertainty"]

@@ -17,15 +17,7 @@ from unrender.runs.earlier_image import FIRST_CANDIDATE, falls, no_improvement
 from unrender.runs.folder.schema import MISFIT, WORSE
 from unrender.runs.reference_distortions import AS_IF, distortions
 from unrender.runs.result import Result
-from unrender.runs.verification import (
-    PRIOR,
-    STEPS,
-    Misfit,
-    as_few_samples,
-    compares,
-    misfit,
-    without_prior,
-)
+from unrender.runs.verification import PRIOR, STEPS, Misfit, as_few_samples, compares, misfit, without_prior
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import slices_of_images
 

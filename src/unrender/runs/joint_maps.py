@@ -193,8 +193,7 @@ class _Surface:
         diagonal = np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1).sum(axis=(0, 1)), 0.0)
         # Eigenvectors have no sign: one direction remains where values are at their bounds.
         after, parts = max(
-            (self._within(fields, sign * amounts, diagonal) for sign in (1.0, -1.0)),
-            key=lambda of: sum(of[1].values()),
+            (self._within(fields, sign * amounts, diagonal) for sign in (1.0, -1.0)), key=lambda of: sum(of[1].values())
         )
         total = sum(parts.values())
         joint = float(np.einsum("hwi,hwij,hwj->", amounts, matrix, amounts))

@@ -52,11 +52,7 @@ class RunOrder:
 
 @contextmanager
 def execution(
-    problem: Problem,
-    order: RunOrder,
-    directory: Path,
-    console: Console,
-    progress: Progress,
+    problem: Problem, order: RunOrder, directory: Path, console: Console, progress: Progress
 ) -> Iterator[dict[str, Any]]:
     """Print the plan and yield the arguments of `optimize`, which writes a run folder. Remove live files if the block succeeds."""
     plan = order.method.plan(problem, order.settings)

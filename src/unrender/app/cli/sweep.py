@@ -48,9 +48,7 @@ _Trials = Annotated[
 _Window = Annotated[
     int | None,
     typer.Option(
-        min=1,
-        max=arguments.MOST_TRIALS,
-        help="With tpe: limit of concurrent trials. [default: 4, or two per worker]",
+        min=1, max=arguments.MOST_TRIALS, help="With tpe: limit of concurrent trials. [default: 4, or two per worker]"
     ),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300 without --seconds]")]

@@ -57,13 +57,7 @@ class Traffic:
 class DistributedExecutor:
     """An `Executor` whose worker processes hold shares of the views; it sums their gradients in the order of the shares."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        shares: tuple[tuple[int, ...], ...],
-        hosts: Hosts,
-        variant: str = "",
-    ):
+    def __init__(self, problem: Problem, shares: tuple[tuple[int, ...], ...], hosts: Hosts, variant: str = ""):
         self.variant = variant
         self._problem, self._shares, self._hosts = problem, shares, hosts
         self._outbox, self._memories = Outbox(), Memories()
