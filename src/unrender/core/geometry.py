@@ -41,6 +41,15 @@ MITSUBA_TO_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 MITSUBA_TO_OPENGL.setflags(write=False)
 
 
+def shortest_rotation(axis: Sequence[float], end: np.ndarray) -> np.ndarray:
+    """Return the shortest rotation (3, 3) from a coordinate axis to a unit vector, as a product of two half turns."""
+    start = np.asarray(axis, float)
+    middle = start + end
+    length = float(np.linalg.norm(middle))
+    middle = middle / length if length > 5e-5 else np.roll(start, 1)
+    return (2 * np.outer(middle, middle) - np.eye(3)) @ (2 * np.outer(start, start) - np.eye(3))
+
+
 def rotation(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation matrix (3, 3) of column vectors, counterclockwise by radians seen from the tip of a unit axis (Rodrigues'
     formula)."""

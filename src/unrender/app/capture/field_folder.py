@@ -15,7 +15,6 @@ from unrender.app.capture import writing
 from unrender.app.capture.capture import INSIDE, CapturedView, StoredViews
 from unrender.app.capture.problem_folder import sensor_element
 from unrender.app.evaluation.scenes import HELD_OUT
-from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.app.stages.stages_file import Stage, Stages
 from unrender.core.errors import InputError
@@ -78,17 +77,17 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     `InputError` if the cameras have no common focus."""
     bare = views.bare()
     middle, half = cube_of(np.array([view.camera_to_world for view in bare]))
-    stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(bare)]
+    stems = writing.stems(view.name for view in bare)
     for part in (writing.REFERENCES, writing.MASKS, GRIDS):
         (folder / part).mkdir()
-    means, masked = [], []
+    means, masks = [], []
     for view, stem in zip(views, stems, strict=True):
         shown = view.shown > INSIDE
         if not view.held_out:
             means.append(float(view.values[shown].mean()))
         images.write(view.values, folder / writing.REFERENCES / f"{stem}.exr", half=True)
-        masked.append(not shown.all())
-        if masked[-1]:
+        masks.append("" if shown.all() else stem)
+        if masks[-1]:
             writing.write_mask(shown, folder / writing.MASKS / f"{stem}.png")
     level = max(float(np.mean(means)), 1e-4)
     size = (voxels,) * 3
@@ -106,10 +105,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         {"key": _KEYS[one], **bounds.get(one, {}), **({"learning_rate": rates[one]} if one in rates else {})}
         for one in moved
     ]
-    listed = []
-    for index, (view, stem) in enumerate(zip(bare, stems, strict=True)):
-        mask = {"mask": f"{writing.MASKS}/{stem}.png"} if masked[index] else {}
-        listed.append((view.held_out, {"reference": f"{writing.REFERENCES}/{stem}.exr", "sensor": index} | mask))
+    listed = writing.views((view.held_out for view in bare), stems, masks, [{}] * len(stems))
     writing.write_problems(folder, name, listed, tables, "L2", 1)
     note = "Each stage has twice the voxels a side. Run all: unrender run stages.toml. Written by `unrender import`."
     (folder / stages_file.FILE).write_text(stages_file.text(_stages(voxels, moved), note), encoding="utf-8")

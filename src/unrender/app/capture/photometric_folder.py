@@ -26,8 +26,8 @@ from unrender.app.capture.cameras import Lens
 from unrender.app.capture.formats.lights import LitCapture
 from unrender.app.capture.views import Resampling, pinhole
 from unrender.app.evaluation.scenes import HELD_OUT
-from unrender.app.exporting.ready_made import file_name
 from unrender.core.errors import InputError
+from unrender.core.geometry import shortest_rotation
 from unrender.io import images
 from unrender.losses.metrics import srgb
 from unrender.rendering.exposure import EXPOSURE
@@ -186,13 +186,11 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
     )
     (folder / writing.SCENE).write_bytes(_scene(views, strength))
     writing.write_mask(inside, folder / writing.MASKS / "mask.png")
-    listed = []
-    known = writing.turned_light(np.array([_towards(direction) for direction in views.directions]))
-    for index, (photograph, values) in enumerate(zip(views.names, views.values, strict=True)):
-        file = f"{writing.REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
-        images.write(values, folder / file, half=True)
-        fields = {"reference": file, "sensor": index, "mask": f"{writing.MASKS}/mask.png"}
-        listed.append((views.held_out[index], fields | known[index]))
+    stems = writing.stems(views.names)
+    for stem, values in zip(stems, views.values, strict=True):
+        images.write(values, folder / writing.REFERENCES / f"{stem}.exr", half=True)
+    turns = np.array([shortest_rotation((0, 0, 1), direction) for direction in views.directions])
+    listed = writing.views(views.held_out, stems, ["mask"] * len(stems), writing.turned_light(turns))
     unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in chosen]
     writing.write_problems(folder, name, listed, unknowns, "L1", 2)
 
@@ -201,10 +199,8 @@ def _scene(views: LitViews, strength: float) -> bytes:
     """Return the scene under the first light. The camera looks along -z at a plate of width 2; each photograph has its own sensor."""
     root = Xml.Element("scene", version="3.0.0")
     height, width = views.mask.shape
-    for index, photograph in enumerate(views.names):
-        sensor = Xml.SubElement(
-            root, "sensor", type="perspective", id=f"light-{index:04d}-{file_name(Path(photograph).stem)}"
-        )
+    for stem in writing.stems(views.names):
+        sensor = Xml.SubElement(root, "sensor", type="perspective", id=f"light-{stem}")
         writing.add_value(sensor, "string", "fov_axis", "x")
         writing.add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(1 / _DISTANCE)))
         transform = Xml.SubElement(sensor, "transform", name="to_world")
@@ -222,10 +218,3 @@ def _scene(views: LitViews, strength: float) -> bytes:
     Xml.SubElement(light, "vector", name="direction", x=x, y=y, z=z)
     Xml.SubElement(light, "rgb", name="irradiance", value=repr(np.pi * strength))
     return writing.encoded(root)
-
-
-def _towards(direction: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation from z, the lamp's direction, to a direction with z > 0, (3, 3)."""
-    x, y, z = direction
-    k = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
-    return np.eye(3) + k + k @ k / (1 + z)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -15,7 +14,6 @@ from unrender.app.capture.capture import INSIDE, CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
 from unrender.app.capture.silhouettes import Silhouettes, light_turns
 from unrender.app.evaluation.scenes import HELD_OUT
-from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
 from unrender.core.geometry import MITSUBA_TO_OPENGL
@@ -49,7 +47,7 @@ def write(
     Training masks have a border of `band` pixels with reduced weight. The light of a `turntable` is fixed relative to the cameras. Raises
     `InputError` if a mask covers no pixel completely.
     """
-    stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
+    stems = writing.stems(view.name for view in views)
     (folder / MESH).write_bytes(ply(mesh))
     turns = light_turns(np.array([view.camera_to_world for view in views])) if turntable else None
     (folder / writing.SCENE).write_bytes(_scene(views, stems, mesh, chosen, None if turns is None else turns[0]))
@@ -73,21 +71,13 @@ def write(
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
     tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))))
-    listed = _listed(views, stems, [{}] * len(views) if turns is None else writing.turned_light(turns))
+    known = [{}] * len(views) if turns is None else writing.turned_light(turns)
+    listed = writing.views((view.held_out for view in views), stems, stems, known)
     writing.write_problems(folder, name, listed, tables, loss, _MAX_DEPTH)
     note = "Each stage starts from the result of the previous stage. Run all: unrender run stages.toml"
     stages = unknowns.stages(chosen, Path(writing.PROBLEM))
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
-
-
-def _listed(views: CapturedViews, stems: Sequence[str], known: Sequence[dict[str, Any]]) -> list[tuple[bool, dict]]:
-    """Return whether each view is held out, and its table in the problem file, which includes `known`."""
-    listed = []
-    for index, (view, stem, own) in enumerate(zip(views, stems, known, strict=True)):
-        reference, mask = f"{writing.REFERENCES}/{stem}.exr", f"{writing.MASKS}/{stem}.png"
-        listed.append((view.held_out, {"reference": reference, "sensor": index, "mask": mask} | own))
-    return listed
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
@@ -142,8 +132,7 @@ def _scene(
     light = Xml.SubElement(root, "emitter", type="envmap", id="light")
     writing.add_value(light, "string", "filename", LIGHT)
     if turn is not None:
-        transform = Xml.SubElement(light, "transform", name="to_world")
-        Xml.SubElement(transform, "matrix", value=" ".join(map(repr, turn.ravel().tolist())))
+        writing.add_pose(light, turn)
     return writing.encoded(root)
 
 
@@ -170,8 +159,6 @@ def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xm
     writing.add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
     writing.add_value(sensor, "float", "near_clip", near)
     writing.add_value(sensor, "float", "far_clip", far)
-    transform = Xml.SubElement(sensor, "transform", name="to_world")
-    numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
-    Xml.SubElement(transform, "matrix", value=numbers)
+    writing.add_pose(sensor, to_world(view.camera_to_world))
     writing.add_film(sensor, lens.width, lens.height)
     return sensor

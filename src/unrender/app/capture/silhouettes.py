@@ -176,8 +176,6 @@ def likeness(views: CapturedViews) -> float:
     """
     from scipy import ndimage
 
-    from unrender.losses.metrics import srgb
-
     if len(views) < _FEWEST_VIEWS or len({view.values.shape for view in views}) > 1:
         return 0.0
     longer = max(views[0].values.shape[:2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 
 from unrender.app.evaluation.scenes import HELD_OUT
+from unrender.app.exporting.ready_made import file_name
 from unrender.display.pictures import png
 from unrender.io import toml_lines
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
@@ -53,6 +54,22 @@ def write_problems(
             (folder / file).write_text(text, encoding="utf-8")
 
 
+def stems(names: Iterable[str]) -> list[str]:
+    """Return the names of the files of some photographs, without their endings."""
+    return [f"{index:04d}-{file_name(Path(name).stem)}" for index, name in enumerate(names)]
+
+
+def views(
+    held_out: Iterable[bool], stems: Iterable[str], masks: Iterable[str], known: Iterable[dict[str, Any]]
+) -> list[tuple[bool, dict[str, Any]]]:
+    """Return whether each view is held out, and its table with its own sensor, the stem of its mask, "" for none, and `known` fields."""
+    listed = []
+    for index, (apart, stem, mask, own) in enumerate(zip(held_out, stems, masks, known, strict=True)):
+        fields: dict[str, Any] = {"reference": f"{REFERENCES}/{stem}.exr", "sensor": index}
+        listed.append((apart, fields | ({"mask": f"{MASKS}/{mask}.png"} if mask else {}) | own))
+    return listed
+
+
 def turned_light(rotations: np.ndarray) -> list[dict[str, Any]]:
     """Return the fields of views with which the light has these rotations (N, 3, 3), where the scene's light has the first."""
     from scipy.spatial.transform import Rotation
@@ -73,6 +90,12 @@ def add_film(sensor: Xml.Element, width: int, height: int) -> None:
     add_value(film, "integer", "height", height)
     add_value(film, "string", "pixel_format", "rgb")
     Xml.SubElement(film, "rfilter", type="box")
+
+
+def add_pose(parent: Xml.Element, matrix: np.ndarray) -> None:
+    """Add `to_world`, (3, 3) or (4, 4)."""
+    transform = Xml.SubElement(parent, "transform", name="to_world")
+    Xml.SubElement(transform, "matrix", value=" ".join(map(repr, matrix.ravel().tolist())))
 
 
 def write_mask(weights: np.ndarray, path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.app.exporting.scene_folder import export
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
+from unrender.core.geometry import shortest_rotation
 from unrender.io import images
 from unrender.rendering.mitsuba.description import load
 from unrender.scene.problem import Problem
@@ -98,12 +99,7 @@ def up_axis(cameras: list[Any]) -> np.ndarray:
 
 def turned_up(up: np.ndarray) -> np.ndarray:
     """Return the shortest rotation (3, 3) from y to an axis; the sky of environment maps is at y."""
-    y = np.array([0.0, 1.0, 0.0])
-    axis, cosine = np.cross(y, up), float(up[1])
-    if cosine < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + k + k @ k / (1 + cosine)
+    return shortest_rotation((0, 1, 0), up)
 
 
 def render(scene: Any, sensor: Any, spp: int, max_depth: int, seed: int = 0, hide: bool = False) -> np.ndarray:
