@@ -400,13 +400,14 @@ class Residuals(Callback):
 
 
 def test_mean_residuals_are_kept_only_for_an_optimizer_that_states_errors() -> None:
-    """Of 20 pixels, 24 bytes each, and the Hessian. A checkpoint of the others has the three parameters of the last step alone."""
+    """Of 20 pixels, 24 bytes each, as many for an earlier image, and the Hessian. A checkpoint of the others has the three parameters of
+    the last step alone."""
     seen = {}
     for optimizer in (AveragedNewton(), ur.optimizers.Newton()):
         one = seen[type(optimizer)] = Residuals()
         ur.optimize(problem(), ur.GaussNewton(2, 2), optimizer, steps=3, callbacks=[one])
     assert seen[AveragedNewton].kept == {20 * 24}
-    assert seen[AveragedNewton].stored == {20 * 24 + 9 * 8 + 3 * 8}
+    assert seen[AveragedNewton].stored == {2 * 20 * 24 + 9 * 8 + points * 3 * 8 for points in (1, 2)}
     assert seen[ur.optimizers.Newton].kept == {0}
     assert seen[ur.optimizers.Newton].stored == {3 * 8}
 
@@ -820,3 +821,77 @@ def test_both_find_the_minimum_of_a_noisy_problem_and_go_on_where_they_were(tmp_
     again = ur.resume(tmp_path / "run", made, steps=16)
     for key, value in whole.parameters.items():
         np.testing.assert_array_equal(again.parameters[key], value)
+
+
+class Kinked(AnalyticRenderer):
+    """Some pixels are proportional to x, others to its excess over 0.1, as a face that a sun reaches from some angle on."""
+
+    def _flat(self, parameters: Any) -> np.ndarray:
+        x = super()._flat(parameters)
+        return np.concatenate([x, np.maximum(x - 0.1, 0.0)])
+
+
+@pytest.mark.parametrize("tested", [True, False])
+def test_differences_that_do_not_predict_the_change_of_images_become_narrower(
+    tested: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wide differences at 0.09 are of the pixels beyond the kink, whose change is 0 there. Steps by them hardly move."""
+    if not tested:
+        monkeypatch.setattr(module, "_MOST_WRONG", np.inf)
+    renderer = Kinked({"x": np.zeros(1)}, np.ones((4 * 5 * 3, 1)), 0.0, noise=0.0, grain=0.02, shape=(4, 5))
+    pattern = np.random.default_rng(1).uniform(-1.0, 1.0, (20, 1)).repeat(3, axis=0)
+    renderer.offset = 5.0 * pattern[:, 0]
+    renderer.matrix = pattern * np.where(np.arange(60)[:, None] < 30, [1.0, 0.0], [0.0, 20.0])
+    unknown = [ur.Parameter("x", initial=np.array([0.09]))]
+    made = ur.Problem(renderer, unknown, [ur.View(renderer.exact({"x": np.zeros(1)}))], truth={"x": np.zeros(1)})
+    ends = []
+    for seed in range(4):
+        estimator = ur.GaussNewton(64, 8, remember=True, largest={"x": 0.1})
+        result = ur.optimize(made, estimator, AveragedNewton(), steps=20, seed=seed, progress=False)
+        ends.append(abs(float(result.parameters["x"][0])))
+    assert (max(ends) < 0.02) is tested
+    assert (min(ends) > 0.05) is not tested
+
+
+def test_the_prediction_of_derivative_images_has_no_bias_by_noise() -> None:
+    """Means over 300 draws within 4 standard errors, and the variance within its own. The square of one half has a bias."""
+    rng, step = np.random.default_rng(0), np.array([0.3, -0.2])
+    derivatives, weights = rng.normal(size=(2, 4, 5, 3)), np.full((4, 5, 3), 0.7)
+    predicted, found, biased = np.tensordot(step, derivatives, axes=1), [], []
+    for _ in range(300):
+        before, now, of = (
+            derivative_images.HalvesMean(*(x + rng.normal(scale=noise, size=(2, *x.shape))))
+            for x, noise in ((0.0 * predicted, 1.0), (predicted, 1.0), (derivatives, 0.5))
+        )
+        found.append(derivative_images.secant_products(before, now, of, step, weights))
+        biased.append(0.7 * np.square(np.tensordot(step, of.one, axes=1)).sum())
+    sums, square = np.array(found), 0.7 * float(np.square(predicted).sum())
+    errors = sums.std(axis=0) / np.sqrt(300)
+    assert (np.abs(sums[:, :2].mean(axis=0) - square) < 4.0 * errors[:2]).all()
+    assert float(np.mean(biased)) - square > 4.0 * errors[1]
+    assert sums[:, 2].mean() == pytest.approx((sums[:, 0] - sums[:, 1]).var(), rel=4.0 * np.sqrt(2.0 / 300))
+
+
+def test_a_gradient_of_far_more_noise_is_left_out_once() -> None:
+    """A path that finds the sun by chance moved the mean, and hid for many steps that the mean was outdated."""
+    optimizer, x = AveragedNewton(), {"x": np.zeros(3)}
+    state = optimizer.init(x)
+    for gradient, noise, left_out in ((1.0, 1.0, False), (1.1, 1.0, False), (90.0, 1e4, True), (95.0, 1e4, False)):
+        parts = Hessian(HESSIAN), GradientNoise(1e-4 * noise * HESSIAN)
+        before = state
+        steps, state = optimizer.update(Estimate(0.0, {"x": gradient * np.ones(3)}, parts), state, x)
+        assert np.array_equal(state.target, before.target) is left_out
+        assert bool(steps["x"].any()) is not left_out
+
+
+@pytest.mark.parametrize("out", [True, False])
+def test_after_it_the_models_still_tell_that_their_mean_is_outdated(out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not out:
+        monkeypatch.setattr(averaged_newton, "_OUTLIER", np.inf)
+    optimizer, x = AveragedNewton(), {"x": np.zeros(3)}
+    state = optimizer.init(x)
+    for step in range(12):
+        minimum, noise = (0.0 if step < 11 else 0.1) * np.ones(3), 1e4 if step == 5 else 1.0
+        parts = Hessian(HESSIAN), GradientNoise(1e-5 * noise * HESSIAN)
+        _, state = optimizer.update(Estimate(0.0, {"x": -HESSIAN @ minimum}, parts), state, x)
+    assert bool(state.counts.max() < 2.0) is out

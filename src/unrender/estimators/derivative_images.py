@@ -17,7 +17,7 @@ _RESIDUAL_ERRORS = 2.0  # standard errors of the sum of squared residuals from w
 _VALUES = 1 << 22  # maximum number of image values that are converted to double precision at once
 _MEMORY, _CHANNEL_MEMORY = 0.3, 0.1
 """Weight of the latest image in the running mean of the variance of a pixel, and of one of its channels, which has more noise itself."""
-_LAUNCH = 1 << 13
+LAUNCH = 1 << 13
 """Time of starting a render, in that of paths: 4,000 to 19,000 on two cores, for four scenes of `suite.numbers`."""
 _GROWTH = 1.0  # weights of derivative images in their mean grow as this power of their number
 
@@ -162,7 +162,7 @@ def needs_derivatives(noise: float, images: float, derivatives: float, image: in
 
 def cost(paths: int, renders: int) -> int:
     """Return the time that some renders take, in that of paths."""
-    return paths + renders * _LAUNCH
+    return paths + renders * LAUNCH
 
 
 def mean_residuals(
@@ -178,6 +178,24 @@ def mean_residuals(
         return now
     slopes = 0.5 * (derivatives.one + derivatives.other)
     return before.plus(weights.second * np.tensordot(step, slopes, axes=1)).and_one(now, moved)
+
+
+def secant_products(
+    before: HalvesMean, now: HalvesMean, derivatives: HalvesMean, step: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Return Σ p y, Σ p² and the variance of their difference, (3,), over a view's pixels (H, W, 3) with weights, such as ℓ''.
+
+    y is the change of the image by a step (m,), and p = J s the change that derivative images predict. Noise biases neither sum.
+    """
+    one, other = (np.tensordot(step, half.astype(np.float64), axes=1) for half in (derivatives.one, derivatives.other))
+    changes = now.one - before.one, now.other - before.other
+    mean, noise = 0.5 * (one + other), 0.5 * (one - other)
+    factors = (
+        (mean, 0.5 * (changes[0] + changes[1])), (one, other),
+        (mean, 0.5 * (changes[0] - changes[1])), (mean, noise), (noise, noise),
+    )  # fmt: skip
+    measured, squares, *scatters = ((weights * a * b).sum(axis=-1) for a, b in factors)
+    return np.array([measured.sum(), squares.sum(), sum(np.square(x).sum() for x in scatters)])
 
 
 def references_have_noise(residuals: Iterable[HalvesMean]) -> bool:

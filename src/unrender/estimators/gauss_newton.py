@@ -45,6 +45,9 @@ _BLIND = 0.3
 """Width up to which it grows while differences change no picture, relative to the parameter, or in its units if it is 0."""
 _SETTLED = 0.5  # maximum step, in units of the widths, after which the shift is halved
 _DRIFT = 0.25  # distance, in units of the widths, from which on mean derivative images are of another point
+_MOST_WRONG, _SECANT_ERRORS, _SECANT_KNOWN, _SHARPEST = 0.5, 3.0, 0.2, 1 / 16
+"""Relative error of the predicted change of images from which on differences are too wide; standard errors beyond it; standard error at
+which it is known; least `sharpness`."""
 _NARROWER = 0.7  # ratio of a width to the one with which mean derivative images began, below which they begin anew
 
 
@@ -66,6 +69,8 @@ class GaussNewtonState:
         noise: noise of the mean derivative images relative to the derivatives, averaged over directions.
         differenced: widths with which the mean derivative images began; {} before the first estimate.
         pictures: mean image of each view; () for losses whose derivative is linear, and before the first estimate.
+        anchor, anchor_point: an earlier image of each view, and its parameters, (n,), since which derivative images are tested.
+        sharpness: factor of the target shift, at most 1, smaller where derivative images did not predict the change of images.
     """
 
     widths: dict[str, float]
@@ -80,6 +85,9 @@ class GaussNewtonState:
     noise: float = 0.0
     differenced: dict[str, float] = field(default_factory=dict)
     pictures: tuple[HalvesMean, ...] = ()
+    anchor: tuple[HalvesMean, ...] = ()
+    anchor_point: np.ndarray | None = None
+    sharpness: float = 1.0
 
     @property
     def narrowed(self) -> bool:
@@ -220,7 +228,28 @@ class GaussNewton:
             ),
             {"samples": point.samples, "images": system.images},
         )
-        return estimate, self._next(state, system, point, _CHANGE) if system.is_finite() else before
+        if not system.is_finite():
+            return estimate, before
+        return estimate, self._tested(self._next(state, system, point, _CHANGE), system, point)
+
+    def _tested(self, state: GaussNewtonState, system: System, point: Point) -> GaussNewtonState:
+        """Return the state with half the widths if derivative images did not predict the change of the images since the anchor.
+
+        Differences of that width are of another part of the images than the one that a step changes.
+        """
+        measured, predicted, variance = system.secant
+        length = point.since(state.anchor_point, state)[1] if state.anchor else math.inf
+        if predicted > 0.0 and length <= 1.0 and state.shift == self.shift:
+            ratio, error = measured / predicted, math.sqrt(variance) / predicted
+            wrong = abs(ratio - 1.0) > _MOST_WRONG + _SECANT_ERRORS * error
+            if wrong and state.sharpness > _SHARPEST:
+                widths = {key: 0.5 * width for key, width in state.widths.items()}
+                state = replace(state, widths=widths, sharpness=0.5 * state.sharpness)
+            elif error > _SECANT_KNOWN:
+                return state
+        elif length <= 1.0:
+            return state
+        return replace(state, anchor=tuple(system.latest), anchor_point=point.theta)
 
     def _needs_derivatives(self, point: Point, state: GaussNewtonState) -> bool:
         """Return whether a step has new derivative images: while the mean is of another point, shift or width, or has too much noise."""
@@ -254,7 +283,7 @@ class GaussNewton:
         for key, width in state.widths.items() if system.fresh else ():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
             known = 0.0 < square < math.inf and 0.0 < slope < math.inf
-            target = state.shift * math.sqrt(slope / square) if known else width
+            target = state.sharpness * state.shift * math.sqrt(slope / square) if known else width
             if square <= 0.0 < slope < math.inf:  # few samples show no small change
                 target = max(width, _BLIND * (float(np.abs(arrays.numpy(point.parameters[key])).max()) or 1.0))
             widths[key] = float(np.clip(target, width / change, min(width * change, point.largest[key])))

@@ -23,6 +23,7 @@ from unrender.estimators.derivative_images import (
     noise_weights,
     products,
     running_mean,
+    secant_products,
     squared_slope,
 )
 from unrender.estimators.gradient_sum import smoothed_variance
@@ -50,6 +51,8 @@ class System:
         derivatives: mean derivative images of each view.
         residuals: mean derivatives of the loss of each view.
         pictures: mean image of each view; [] for losses whose derivative is linear.
+        latest: image of each view; [] without scores.
+        secant: sums of `secant_products` since the state's anchor.
         fresh: whether there are new derivative images.
     """
 
@@ -63,6 +66,8 @@ class System:
     derivatives: list[HalvesMean] = field(default_factory=list)
     residuals: list[HalvesMean] = field(default_factory=list)
     pictures: list[HalvesMean] = field(default_factory=list)
+    latest: list[HalvesMean] = field(default_factory=list)
+    secant: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def is_finite(self) -> bool:
         """Return whether all sums are finite."""
@@ -127,6 +132,14 @@ class Point:
                 before = state.residuals[len(total.residuals)] if state.residuals else None
                 residuals = mean_residuals(before, weights, mean, step[elements], moved)
                 total.residuals.append(residuals)
+            if self.scores and images and weights is not None:
+                one, other = (arrays.numpy(x).astype(np.float32) for x in (images.one, images.other))
+                latest = HalvesMean(one, other)
+                if state.anchor:
+                    change = (self.theta - state.anchor_point)[elements]
+                    before = state.anchor[len(total.latest)]
+                    total.secant += secant_products(before, latest, mean, change, weights.second)
+                total.latest.append(latest)
             own = None if inverse is None else inverse[np.ix_(elements, elements)]
             parts = [mean.one, mean.other], weights, residuals, int(state.shift), self.options.remember, own
             total.products.add(products(*parts), elements)

@@ -43,6 +43,8 @@ is 1, so noise alone neither closes the region nor opens it."""
 _LEAST_NOISE, _SURPRISE_ERRORS = 1e-6, 6.0
 """Relative eigenvalue of the gradient's noise below which a direction has none, and standard errors of a mean square of 1 that noise may
 reach."""
+_OUTLIER = 100.0
+"""Ratio of a gradient's variance by noise to the mean one from which on it is left out, once at a time: noise may have grown."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
@@ -69,6 +71,7 @@ class AveragedNewtonState:
         radii: radius of the trust region of each element, (n,), in its units; 0 without a limit.
         step: last step, in units of the parameters, (n,).
         scores: latest covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; None if it is unknown.
+        ignored: whether the last model was left out as an outlier, (n,).
     """
 
     learning_rates: dict[str, float]
@@ -83,6 +86,7 @@ class AveragedNewtonState:
     radii: np.ndarray
     step: np.ndarray
     scores: np.ndarray | None
+    ignored: np.ndarray
 
     def upsampled(self, upsampler: Upsampler) -> AveragedNewtonState:
         """Return this state. Raises `NotCarried` if one of its parameters changes its resolution."""
@@ -154,7 +158,9 @@ class AveragedNewton:
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, self.trust_radius or 0.0)
-        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, None)
+        return AveragedNewtonState(
+            own, square, row, square, square, row, row, row, square, radii, row, None, np.zeros(n, bool)
+        )
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -176,9 +182,14 @@ class AveragedNewton:
         noise, gradient_noise = state.noise.copy(), state.gradient_noise.copy()
         shares, counts = state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
+        ignored = state.ignored.copy()
         outwards = sides_of_bounds(estimate, parameters)
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
+            if not ignored[block].any() and _is_outlier(fluctuation[both], gradient_noise[both]):
+                ignored[block], lengths[block] = True, state.lengths[block]
+                continue
+            ignored[block] = False
             news = gradient[block] - (matrix[both] @ x[block] - target[block])
             surprise = _surprise(news, fluctuation[both] + shares[block].max() * gradient_noise[both])
             surprise *= _outdated(matrix[both], hessian[both], added[both])
@@ -204,7 +215,7 @@ class AveragedNewton:
             )
             lengths[block] = _length(x[block], step[block], scale[block], own > scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, scores,
+            state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, scores, ignored,
         )  # fmt: skip
 
     def averages(self, keys: Iterable[str], state: Any = None) -> frozenset[str]:
@@ -301,6 +312,15 @@ def _length(x: np.ndarray, step: np.ndarray, scale: np.ndarray, linear: np.ndarr
     """
     relative = step[linear] / (np.abs(x + step) + _OF_WIDTH * scale)[linear]
     return max(float(np.linalg.norm(step / scale)), float(np.linalg.norm(relative)))
+
+
+def _is_outlier(noise: np.ndarray, mean: np.ndarray) -> bool:
+    """Return whether a gradient has far more noise (n, n) than those before, as by a path that finds the sun by chance.
+
+    Its gradient would move the mean, and its noise would hide for many steps that the mean is outdated.
+    """
+    usual = np.diag(mean)
+    return bool(usual.all() and (np.diag(noise) > _OUTLIER * usual).any())
 
 
 def _surprise(news: np.ndarray, noise: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import Hessian, HessianNoise
-from unrender.estimators.derivative_images import cost
+from unrender.estimators.derivative_images import LAUNCH, cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
@@ -278,7 +278,10 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
     moved = [key for key in keys if key in traits.poses]
     poses = [key for key in moved if not traits.infos[key].light]
-    differences = within(constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels))
+    fewest, most = constants.difference_spp
+    if images >= 1.0 and moved and not poses and len(moved) == len(keys):  # all differences of a view share a launch
+        most = max(most, LAUNCH * len(problem.views) // (elements * problem.pixels))
+    differences = within((fewest, most), constants.difference_paths // (2 * elements * problem.pixels))
     renders, least = 2 * elements * differences * problem.pixels, constants.block_paths
     if images >= 1.0:  # no block: states that differ in poses only are rendered together
         renders, least = cost(renders, 4 if len(moved) == len(keys) else 4 * elements), constants.number_paths
