@@ -123,7 +123,8 @@ def test_all_paths_are_at_most_a_fiftieth_of_the_runs_and_more_paths_have_their_
     assert paths <= 0.02 * 40 * 1024 * SIDE * SIDE
 
 
-@pytest.mark.parametrize(("spp", "steps"), [(4, 64), slow(8, 150), slow(16, 300)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("spp", "steps"), [(4, 64), (8, 150), (16, 300)])
 def test_all_pictures_of_a_run_of_a_million_paths_use_at_most_a_fiftieth_of_them(spp: int, steps: int) -> None:
     """The start, candidates, the end, the control variate, and what larger images use."""
     problem, forms = noting(made(views=30))
