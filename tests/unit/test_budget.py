@@ -313,6 +313,13 @@ def test_an_invalid_budget_is_refused(steps: Any, seconds: Any, message: str) ->
         budget.check_budget(steps, seconds)
 
 
+def test_the_plan_of_another_problem_is_refused() -> None:
+    """The optimizer of a plan in a file names parameters; a run folder whose problem has got other keys has such a plan."""
+    optimizer = ur.optimizers.ScheduleFree(preconditioner=ur.preconditioners.Sobolev(), preconditioned=("wall.data",))
+    with pytest.raises(ur.InputError, match='preconditioned: unknown parameter "wall.data"'):
+        ur.optimize(problem(), ur.PathGradient(spp=2), optimizer, steps=1)
+
+
 def test_numbers_of_numpy_are_a_budget() -> None:
     parts = ur.PathGradient(spp=2), ur.optimizers.Adam(0.01)
     result = ur.optimize(problem(), *parts, steps=np.int64(3), seconds=np.float32(60))  # pyright: ignore[reportArgumentType]

@@ -99,8 +99,8 @@ def problem_of(directory: str | Path) -> Problem:
     path = folder / serialization.FILE
     if not bounded_files.exists(path):
         raise InputError(
-            f"{path}: no such file: Result.save stores no problem; pass it, as unrender.app.export((problem, result.parameters), "
-            "out), or store a complete run, with run_directory="
+            f"{path}: no such file: Result.save stores no problem; pass it, as unrender.resume(folder, problem) and "
+            "unrender.app.export((problem, result.parameters), out), or store a complete run, with run_directory="
         )
     stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
     if "gallery" in stored:

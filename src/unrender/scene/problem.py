@@ -222,8 +222,8 @@ class Problem(ViewLosses):
         return self.with_parts(unknowns={**self.unknowns, **changed})
 
     def topology(self, key: str) -> MeshTopology | None:
-        """Return the topology of the mesh whose vertices carry the parameter, (n V,); None for textures, grids and numbers."""
-        return mesh_topology(self.renderer.parameters()[key])
+        """Return the topology of the mesh whose vertices carry the parameter, (n V,); None for all others."""
+        return mesh_topology(self.renderer.parameters().get(key))
 
     def texture_coordinates(self, key: str) -> np.ndarray | None:
         """Return the texture coordinates (V, 2) of the mesh whose vertex positions are the parameter `key`; None if it has none."""

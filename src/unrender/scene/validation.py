@@ -219,9 +219,9 @@ def _check_parameterisation(
     return made, made.transform(bounds, initial)
 
 
-def mesh_topology(info: ParameterInfo) -> MeshTopology | None:
-    """Return the topology of the mesh whose vertices carry the parameter; None if there is none."""
-    return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
+def mesh_topology(info: ParameterInfo | None) -> MeshTopology | None:
+    """Return the topology of the mesh whose vertices carry the parameter; None if there is none, or no parameter."""
+    return None if info is None or info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
 
 
 def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray | None:
