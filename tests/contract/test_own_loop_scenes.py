@@ -123,6 +123,8 @@ def test_a_scene_of_another_variant_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(problem.renderer.pair.loaded(), "variant", "llvm_ad_spectral")
     with pytest.raises(InputError, match=r"scene: it was loaded under llvm_ad_spectral, and .*; call unrender\.use\("):
         ur.optimize(problem, "plain", steps=1, progress=False)
+    with pytest.raises(InputError, match="it was loaded under llvm_ad_spectral"):
+        problem.initial()  # under a scalar variant it has no arrays
     Foreign = type("Scene", (), {"__module__": "mitsuba.scalar_rgb"})
     with pytest.raises(InputError, match="loaded under another variant than"):
         ur.Renderer(Foreign(), KEYS)

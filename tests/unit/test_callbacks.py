@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import unrender as ur
@@ -141,3 +143,26 @@ def test_a_path_in_place_of_a_problem_is_refused_in_one_line() -> None:
     path: Any = "room.toml"
     with pytest.raises(ur.InputError, match="optimize: expected a Problem, such as"):
         ur.optimize(path, steps=1)
+
+
+def test_a_callback_may_add_arrays_to_the_history_and_return_nothing(tmp_path: Path) -> None:
+    """A mean by NumPy in a record ended the run in a traceback."""
+
+    class Own(Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            record |= {"psnr": np.float32(1.5), "sizes": np.array([1.0, np.nan]), "thing": Path}
+
+        def on_result(self, run: Any, result: ur.Result) -> Any:
+            self.steps = result.steps
+
+    own, parts = Own(), (ur.PathGradient(spp=2), ur.optimizers.Adam(0.01))
+    result = ur.optimize(problem(), *parts, steps=2, callbacks=[own], run_directory=tmp_path / "run")
+    assert own.steps == result.steps == 2
+    record = json.loads((tmp_path / "run" / "history.jsonl").read_text().splitlines()[-1])
+    assert (record["psnr"], record["sizes"], record["thing"]) == (1.5, [1.0, None], repr(Path))
+
+
+@pytest.mark.parametrize("folder", ["", 5])
+def test_what_is_no_folder_is_refused(folder: Any) -> None:
+    with pytest.raises(ur.InputError, match="run_directory: expected a folder, got"):
+        ur.optimize(problem(), ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=1, run_directory=folder)

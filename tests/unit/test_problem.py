@@ -17,6 +17,7 @@ from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.references import View
+from unrender.scene.render import render
 
 HEIGHT, WIDTH = 4, 5
 PIXELS = HEIGHT * WIDTH * 3
@@ -436,6 +437,7 @@ def test_tensors_of_pytorch_may_require_gradients() -> None:
     made = problem([Parameter("wall.value", value)], [View(picture)], truth={"wall.value": value})
     assert made.initial_values()["wall.value"].tolist() == made.truth["wall.value"].tolist() == [0.25, 0.25, 0.25]
     assert np.asarray(made.views[0].reference).tolist() == np.full((HEIGHT, WIDTH, 3), 0.25).tolist()
+    assert np.array_equal(render(made, {"wall.value": value}), render(made))
 
 
 def test_a_deep_copy_is_the_problem_itself() -> None:

@@ -158,7 +158,7 @@ class DropReport:
 
 
 def array_like(value: Any, advice: str) -> Any:
-    """Return a value for `numpy.asarray`, which refuses tensors of PyTorch that require gradients.
+    """Return a value for `numpy.asarray`, which refuses tensors of PyTorch that require gradients or are on a GPU.
 
     Raises `InputError` with advice for a NumPy array of which some elements are masked: as an array they are values like others.
     """
@@ -167,4 +167,4 @@ def array_like(value: Any, advice: str) -> Any:
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"a masked array has values that do not count: {advice}")
     detach = getattr(value, "detach", None)
-    return value if detach is None else detach()
+    return value if detach is None else detach().cpu()

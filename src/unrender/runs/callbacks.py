@@ -93,7 +93,7 @@ class UserCallbacks(Callback):
 
     def on_result(self, run: Run, result: Result) -> Result:
         for callback in self._callbacks:
-            result = callback.on_result(run, result)
+            result = callback.on_result(run, result) or result  # of a callback that returns nothing
         return result
 
     def warnings(self, run: Run) -> list[str]:

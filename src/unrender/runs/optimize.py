@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,7 +15,7 @@ import numpy as np
 from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.core.random import Key
+from unrender.core.random import Key, check_seed
 from unrender.core.text import did_you_mean
 from unrender.display.notebook import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
@@ -130,6 +131,8 @@ def _folder(
     if directory is None:
         yield []
         return
+    if directory == "" or not isinstance(directory, (str, os.PathLike)):  # "" would be the current folder
+        raise InputError(f"optimize: run_directory: expected a folder, got {directory!r:.60}")
     run.folder = Path(directory)
     run.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": serialization.origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
@@ -191,7 +194,7 @@ def estimate(
             inside by 1e-4 of the range: no path has a gradient with respect to a black reflectance, or to a lobe of probability 0.
         seed: seed of the random numbers.
     """
-    estimator = resolve_estimator(problem, estimator, "estimate")
+    seed, estimator = check_seed("estimate: seed", seed), resolve_estimator(problem, estimator, "estimate")
     problem.executor.check(estimator)
     point = off_ends(as_tree(problem, parameters), problem.renderer.parameters())
     state = estimator.init(problem, point)

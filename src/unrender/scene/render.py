@@ -9,7 +9,7 @@ import numpy as np
 from unrender.core import arrays, checks, timing
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.exclusive import exclusive
-from unrender.core.random import Key
+from unrender.core.random import Key, check_seed
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
@@ -46,7 +46,8 @@ def render(
         InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes.
     """
     spp = checks.integer("render", "spp", spp, at_least=1)
-    if not 0 <= view < len(problem.views):
+    seed, view = check_seed("render: seed", seed), checks.integer("render", "view", view, at_least=0)
+    if view >= len(problem.views):
         raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
     point = as_tree(problem, parameters)
     session = problem.renderer.prepare(list(point), None, derivatives=False)
@@ -100,6 +101,7 @@ def render_pair(
     Returns:
         float32 (H, W, 3) of the current state, and the same of the previous state.
     """
+    spp, seed = checks.integer("render_pair", "spp", spp, at_least=1), check_seed("render_pair: seed", seed)
     points = as_tree(problem, current), as_tree(problem, previous)
     session = problem.renderer.prepare(list(points[0]), "path")
     request = SampleRequest(problem.views[0].sensor, spp, Key(seed).uint32())
@@ -119,7 +121,8 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
         raise InputError(f"parameters: expected values by key of the problem's unknowns, got {parameters!r:.60}")
     if set(parameters) != set(point):
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
-    parameters = problem.full(parameters)
+    given = {key: np.asarray(checks.array_like(value, "fill it")) for key, value in parameters.items()}
+    parameters = problem.full(given)
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")

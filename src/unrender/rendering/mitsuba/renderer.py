@@ -165,7 +165,12 @@ class MitsubaRenderer:
 
     def array(self, values: np.ndarray) -> mi.TensorXf:
         """Return the values as `mi.TensorXf` in its own memory."""
+        self._check_variant()
         return tensor(values)
+
+    def _check_variant(self) -> None:
+        if (own := self.pair.loaded().variant) != mi.variant():
+            raise InputError(f"scene: it was loaded under {own}, and {mi.variant()} is set; call unrender.use({own!r})")
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: Derivatives = True
@@ -174,8 +179,7 @@ class MitsubaRenderer:
 
         Poses and other parameters that move geometry cannot be prepared together, since the scenes of posed shapes are not rebuilt.
         """
-        if (own := self.pair.loaded().variant) != mi.variant():
-            raise InputError(f"scene: it was loaded under {own}, and {mi.variant()} is set; call unrender.use({own!r})")
+        self._check_variant()
         names, differentiable = tuple(keys), differentiated(keys, derivatives)
         if (names, differentiable, space) not in self._checked:
             for key in keys:

@@ -110,15 +110,16 @@ class HistoryFile:
 
 
 def lines(records: Iterable[Mapping[str, Any]]) -> bytes:
-    """Return the records as JSON, one per line; numbers that are not finite become null."""
-    return "".join(json.dumps(_finite_or_null(record), allow_nan=False) + "\n" for record in records).encode()
+    """Return the records as JSON, one per line; numbers that are not finite become null, and what JSON cannot store its `repr`."""
+    return "".join(json.dumps(_storable(record), allow_nan=False, default=repr) + "\n" for record in records).encode()
 
 
-def _finite_or_null(value: Any) -> Any:
+def _storable(value: Any) -> Any:
+    value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value  # a callback's
     if isinstance(value, Mapping):
-        return {key: _finite_or_null(part) for key, part in value.items()}
+        return {str(key): _storable(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite_or_null(part) for part in value]
+        return [_storable(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
