@@ -57,6 +57,10 @@ MISTAKES = [
     (["run", "problem.toml", "--variant", "cuda_ad_rbg"], "did you mean cuda_ad_rgb?"),
     (["run", "problem.toml", "--problem-set", "resolution=8"], "--problem-set resolution: only gallery problems"),
     (["run", "missing.toml"], "missing.toml: no such file"),
+    (
+        ["run", "problem.toml", "--out=~/run"],
+        "--out=~/run: the shell has not replaced ~ by the home folder; write $HOME/run",
+    ),
     (["run", "problems.toml"], "problems.toml: no such file; did you mean problem.toml?"),
     (["run", "problem"], "no problem problem: neither a TOML file nor in the gallery; did you mean problem.toml?"),
     (["run", "wall.xml"], "wall.xml: a scene does not define the unknowns"),
@@ -265,3 +269,11 @@ def test_names_of_a_scene_do_not_command_the_terminal(unrender, problem: Path, m
     page = (problem.parent / "out" / "report.html").read_text()
     assert "owned" in page
     assert all(letter.isprintable() or letter in "\n\t" for letter in page)
+
+
+def test_a_deleted_current_folder_is_one_line(unrender, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Mitsuba's import ended the process."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert unrender("run", "indirect-room").refuses("the current folder no longer exists; change to another one")

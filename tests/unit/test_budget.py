@@ -313,6 +313,18 @@ def test_an_invalid_budget_is_refused(steps: Any, seconds: Any, message: str) ->
         budget.check_budget(steps, seconds)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-5, 1e-11])
+def test_dim_pictures_whose_gradient_is_below_epsilon_are_told(scale: float) -> None:
+    """Such a run ended as finished at its start, and dimmer pictures were said not to depend on the parameter."""
+    matrix = np.random.default_rng(1).uniform(0.0, scale, (48, 2))
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.0, 0.0)
+    dim = ur.Problem(renderer, [ur.Parameter("gain", initial=0.2)], [ur.View(renderer.exact(TRUTH))])
+    result = ur.optimize(dim, ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=6)
+    told = [line for line in result.warnings if "gain: its gradient" in line]
+    assert (len(told), result.history[-1]["loss"] < 1e-9) == ((0, False) if scale == 1.0 else (1, True))
+    assert all("below the optimizer's epsilon of 1e-08" in line for line in told)
+
+
 def test_the_plan_of_another_problem_is_refused() -> None:
     """The optimizer of a plan in a file names parameters; a run folder whose problem has got other keys has such a plan."""
     optimizer = ur.optimizers.ScheduleFree(preconditioner=ur.preconditioners.Sobolev(), preconditioned=("wall.data",))
@@ -326,9 +338,10 @@ def test_numbers_of_numpy_are_a_budget() -> None:
     assert result.steps == 3
     numbers: Any = {"view": np.int64(0), "spp": np.int64(2), "seed": np.int64(1)}
     assert np.array_equal(ur.render(problem(), **numbers), ur.render(problem(), spp=2, seed=1))
-    for wrong in ({"view": 0.0}, {"view": None}, {"seed": 1.5}):
-        with pytest.raises(ur.InputError, match=f"^render: {next(iter(wrong))}"):
-            ur.render(problem(), **wrong)
+    wrong: Any
+    for name, wrong in (("view", 0.0), ("view", None), ("seed", 1.5)):
+        with pytest.raises(ur.InputError, match=f"^render: {name}"):
+            ur.render(problem(), **{name: wrong})
 
 
 def test_slowdown_is_at_least_one() -> None:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unrender.core import arrays, memory
+from unrender.core.arrays import Array
 from unrender.core.geometry import weld
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
 from unrender.optimizers.base import Optimizer, rates_of
-from unrender.optimizers.recipes import Adam, MetaAdam
+from unrender.optimizers.recipes import Adam, MetaAdam, ScheduleFree
 from unrender.pixels.uniform import Views
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder.state import parts
@@ -54,18 +55,22 @@ class BoundsWatch(Callback):
         return lines
 
 
+_LEAST = 1e-30  # square of a norm that is exact in single precision
 _STEPS, _DRAWS = 5, 12
 """Number of first steps whose gradients are tested; the same in units of the steps that drawn views need to show all views."""
 
 
 class InfluenceWatch(Callback):
-    """Callback that warns of parameters whose gradient was exactly zero in each of the first steps.
+    """Callback that warns of parameters whose gradient was zero, or below the optimizer's ε, in each of the first steps.
 
-    These are five, or more if steps draw some of the views. Parameters of a block that is not estimated yet are excluded.
+    Steps of Adam and `ScheduleFree` are then below half of their rate, as with dim pictures: gradients of L2 are their squares.
+
+    The steps are five, or more if steps draw some of the views. Parameters of a block that is not estimated yet are excluded.
     """
 
     def __init__(self) -> None:
         self._steps = 0  # unknown before the first step
+        self._small: dict[str, bool] = {}
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
         self._steps = self._steps or max(_STEPS, _draws(run))
@@ -74,12 +79,28 @@ class InfluenceWatch(Callback):
         zero, steps = run.state.zero_gradient, self._steps
         block = estimate.get(BlockEstimate)
         waiting = block.keys if block is not None and block.estimate is None else ()
+        epsilon = max(
+            (part.epsilon for part in parts(run.optimizer) if type(part) in (Adam, ScheduleFree)), default=0.0
+        )
         for key, gradient in estimate.gradient.items():
-            zero[key] = zero[key] and key not in waiting and arrays.number(memory.square(gradient)) == 0.0
+            norm = _norm(gradient)
+            zero[key] = zero[key] and key not in waiting and norm == 0.0
+            self._small[key] = self._small.get(key, True) and key not in waiting and 0.0 < norm < epsilon
             if zero[key] and run.step == steps:
                 run.warnings.append(
                     f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"
                 )
+            if self._small[key] and run.step == steps:
+                run.warnings.append(
+                    f"parameter {key}: its gradient is below the optimizer's epsilon of {epsilon:g}, so its steps are short; scale lights "
+                    "and references up"
+                )
+
+
+def _norm(gradient: Array) -> float:
+    """Return the Euclidean norm of a gradient, whose square may be below single precision."""
+    square = arrays.number(memory.square(gradient))
+    return math.sqrt(square) if square > _LEAST else math.sqrt(arrays.number(memory.square(gradient / _LEAST))) * _LEAST
 
 
 def _draws(run: Run) -> int:

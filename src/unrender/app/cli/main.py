@@ -21,7 +21,7 @@ from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, TERMINATED
 from unrender.backend import limits, variant
 from unrender.core import timing
 from unrender.core.checks import encode_text
-from unrender.core.errors import UnknownOptionError, UnrenderError, VariantError
+from unrender.core.errors import InputError, UnknownOptionError, UnrenderError, VariantError
 from unrender.core.text import one_line
 
 
@@ -75,10 +75,24 @@ def _command(words: list[str], began: float) -> Callable[[], Any]:
         return doctor
     for argument in words:
         encode_text(argument, "command line")
+        path = argument.rpartition("=")[2]
+        if path == "~" or path.startswith(
+            "~/"
+        ):  # a folder of that name would look like the home folder in every message
+            raise InputError(f"{argument}: the shell has not replaced ~ by the home folder; write $HOME{path[1:]}")
+    if not _has_folder():  # Mitsuba would end the process
+        raise InputError("the current folder no longer exists; change to another one")
     variant.prepare()  # must run before Dr.Jit is imported
     from unrender.app.cli.app import app
 
     return partial(app, words, prog_name="unrender", standalone_mode=False, obj=(began, ["unrender", *words]))
+
+
+def _has_folder() -> bool:
+    try:
+        return bool(os.getcwd())
+    except FileNotFoundError:
+        return False
 
 
 def _status_of(error: BaseException, signals: Signals) -> int | None:
