@@ -24,12 +24,14 @@ from unrender.core import phases
 from unrender.estimators.fresh_pictures import Residuals
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.rendering.renderer import ParameterInfo
 from unrender.runs import determination, final_checks, final_images, joint_maps, least_squares
 from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.optimize import optimize
+from unrender.runs.reference_distortions import misplaced
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 from unrender.runs.verification import NOISE, PRIOR, SMOOTH, STEPS, STEPS_OF_FEW, Misfit, fit_status
@@ -461,6 +463,34 @@ def test_a_highlight_in_another_place_is_told_of_any_unknowns_and_outliers_of_th
 
 UNCHANGED, WIDE = "of its pixels that the unknowns hardly change", 40
 SPOT = np.exp(-((np.arange(WIDE)[:, None, None] - 20) ** 2 + (np.arange(WIDE)[:, None] - 30) ** 2) / 60.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a, b: (a, b), ""),
+        (lambda a, b: (a[:, ::-1], b[:, ::-1]), "as if the reference of views 0, 1 were mirrored left to right"),
+        (lambda a, b: (a, np.rot90(b)), "as if the reference of view 1 were turned by 90° counterclockwise"),
+        (
+            lambda a, b: (b, a),
+            "as if the reference of view 0 were that of view 1 and as if the reference of view 1 were that of view 0",
+        ),
+        (lambda a, b: (np.roll(a, 3, 1), np.zeros_like(b)), ""),
+    ],
+)
+def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: str) -> None:
+    """The darker pictures of a run whose unknowns have made the best of them were said to differ, and no more."""
+    random = np.random.default_rng(4)
+    images = [scipy.ndimage.gaussian_filter(random.random((24, 24, 3)), (1.5, 1.5, 0.0)) for _ in range(2)]
+    views = [SimpleNamespace(reference=np.ascontiguousarray(x), mask=None) for x in change(*images)]
+    ends = [[0.3 * x + 0.1 + random.normal(0.0, 0.01, x.shape) for _ in range(2)] for x in images]
+    ends[1][0][5, 5] = np.nan
+    for known, expected in ((ParameterInfo((), brightness="reflectance"), words), (ParameterInfo((), rigid=True), "")):
+        made = SimpleNamespace(
+            renderer=SimpleNamespace(parameters=lambda known=known: {"a": known}), unknowns={"a": None}, views=views,
+            test_weights=lambda view, of: np.ones((24, 24)),
+        )  # fmt: skip
+        assert misplaced(made, (0, 1), ends) == expected  # type: ignore[arg-type]
 
 
 def half_textured(reference: np.ndarray | None = None, start: float = 0.5) -> Problem:

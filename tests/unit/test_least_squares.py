@@ -105,6 +105,11 @@ def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_tha
     np.testing.assert_allclose(check.standard_errors(values)["a"][:, 0], [5.0, 4.0, np.inf])
     own = check.standard_errors(values, {"a": np.full((3, 1), 3.5)})["a"][:, 0]  # the run knows its noise
     np.testing.assert_allclose(own, [np.sqrt(18.0), 3.5, np.inf])
+    curved = dataclasses.replace(
+        check, errors={"a": np.array([3.1, 2.9])}, steps={"a": np.zeros(2)}, noise={"a": np.zeros(2)}
+    )
+    own = curved.standard_errors({"a": np.zeros(2)}, {"a": np.ones(2)}, complete=True)["a"]
+    np.testing.assert_allclose(own, [3.1, 1.0], rtol=1e-6)  # a run with a third of the check's error understates it
 
 
 def test_errors_of_a_run_that_has_converged_are_no_larger_with_a_check() -> None:
@@ -556,12 +561,13 @@ def test_pixels_out_of_the_mask_do_not_count_for_the_size_of_a_smooth_difference
     assert shares[1] == pytest.approx(shares[0], rel=0.2)
 
 
-def test_pixels_out_of_the_mask_that_are_not_finite_leave_the_others_tested() -> None:
+@pytest.mark.parametrize("masked", [True, False])
+def test_pixels_that_are_not_finite_leave_the_others_tested(masked: bool) -> None:
     """Nothing was tested, in silence: the weight 0 times a value that is no number is none."""
     random, size = np.random.default_rng(0), (16, 16)
     matrix, offset, mask = random.random((16 * 16 * 3, 1)), np.full((*size, 3), 0.1), np.ones(size)
     reference = (0.5 * matrix).reshape(offset.shape) + offset + random.normal(0.0, 0.02, offset.shape)
-    mask[2, 5], offset[2, 5, 1] = 0.0, np.nan
+    mask[2, 5], offset[2, 5, 1] = float(not masked), np.nan
     renderer = AnalyticRenderer({"a": np.zeros(1)}, matrix, offset=offset, noise=0.1, grain=0.1, shape=size)
     made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.3])], [ur.View(reference.astype(np.float32), mask=mask)])
     found = check_numbers(made, {"a": np.full(1, 0.5, np.float32)}, made.initial_values(), FAR)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -36,7 +36,7 @@ from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_key
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
-from unrender.runs.reference_distortions import AS_IF
+from unrender.runs.reference_distortions import AS_IF, misplaced
 from unrender.runs.result import Result
 from unrender.runs.verification import DIFFERS, SMOOTH, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
@@ -167,6 +167,9 @@ def render_final_images(
     deviations = {**deviations, **maps.standard_error} if fits else {}
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
+    if result.steps and (words := misplaced(problem, chosen, ends)):
+        differs = differs and replace(differs, explanation=f", {words}{differs.explanation}")
+        lines = [*lines, f"the final pictures look {words}; check the references"]
     texts, errors_of = (*_named_once(lines, differs), *maps.limited), (deviations, maps.data_share, maps.missing)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 

@@ -71,7 +71,7 @@ def check_numbers(
     so are those with a prior. Standard errors with fixed unknowns would be too small, so there are none: the numbers are `unchecked`.
 
     Steps are reported for losses with a linear derivative only: others have their minimum elsewhere. The result is empty if there are
-    no numbers (see `Numbers.of`), if the renderer rejects a value, or if a picture is not finite.
+    no numbers (see `Numbers.of`), or if the renderer rejects a value. Pixels that are not finite leave the test.
 
     Args:
         values: {key: array} at the end.
@@ -129,7 +129,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             widths = np.minimum(factors * widths, numbers.limits)
     matrix = differences.matrix()
     if not np.isfinite(matrix).all():
-        return NumbersCheck()
+        line = f"{listed(numbers.keys)}: no standard errors: too many pixels of the pictures of the test are not finite"
+        return NumbersCheck(distorted=line)
     if not matrix.any():
         unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
         zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
@@ -170,9 +171,8 @@ def _repeated(
 ) -> tuple[Differences, np.ndarray, np.ndarray]:
     """Return the differences along directions and the residuals (2, P, 3) at the end and with the start's numbers, as means of repeats."""
     weights, repeats, count = np.zeros(directions.shape[1]), 0, directions.shape[1]
-    references = numbers.references()
-    residuals, before = np.zeros((2, *references.shape)), np.zeros((2, *references.shape))
-    began = np.append(numbers.start, numbers.point[numbers.count :])[None]
+    began = np.append(numbers.start, numbers.point[numbers.count :])
+    residuals, before = np.zeros((2, 2, *numbers.references().shape))
     differences = None
     while differences is None or (repeats < _REPEATS and timing.now() < until):
         own = key.fold(_PASSES + 1 + repeats)
@@ -182,9 +182,8 @@ def _repeated(
         differences = more if differences is None else differences.moved(more, more.weights() / weights)
         for half in (0, 1):  # as many pictures as for the differences
             for index in range(count):
-                picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
-                residuals[half] += picture - references
-            before[half] += numbers.pictures(began, own.fold(2 + half))[0] - references
+                residuals[half] += numbers.residual(numbers.point, own.fold(2 + 2 * index + half))
+            before[half] += numbers.residual(began, own.fold(2 + half))
         repeats += 1
     return differences, residuals / (repeats * count), before / repeats
 

@@ -237,6 +237,11 @@ class Numbers:
             timing.add(self.spp * (images.size // 3))
         return np.concatenate(parts, axis=1)
 
+    def residual(self, point: np.ndarray, key: Key) -> np.ndarray:
+        """Return the picture (P, 3) at a point (n + k,) minus the references; 0 in pixels that are not finite."""
+        residual = self.pictures(point[None], key)[0] - self.references()
+        return np.where(np.isfinite(residual).all(axis=1)[:, None], residual, 0.0)
+
     def by_view(self, pictures: np.ndarray) -> list[np.ndarray]:
         """Return pictures (k, P, 3) of all views as (k, H, W, 3) of each view."""
         sizes = [self.problem.sizes[view] for view in self.views]
@@ -269,6 +274,9 @@ class Numbers:
         ends = self.inside(np.concatenate([self.point + directions.T, self.point - directions.T]))
         halves = [self.pictures(ends, key.fold(half)) for half in (0, 1)]
         one, other = (0.5 * (half[:count] - half[count:]) for half in halves)
+        finite = np.isfinite(one + other).all(axis=(0, 2))[:, None]
+        if finite.mean() >= _FINITE:  # the others leave the test
+            one, other = np.where(finite, one, 0.0), np.where(finite, other, 0.0)
         return Differences(0.5 * (ends[:count] - ends[count:]).T.astype(np.float64), one, other)
 
     def slope(self) -> float:
@@ -287,8 +295,11 @@ class Numbers:
         return max(math.sqrt(squares / total), least, 1e-30)
 
 
-_CLEAR = 3.0
-"""Length of a step over its noise from which it counts as a distance, if the run states its own error."""
+_FINITE = 0.99
+"""Least share of pixels that are finite, for which the others leave the test."""
+_CLEAR, _OWN = 3.0, 3.0
+"""Length of a step over its noise from which it counts as a distance, if the run states its own error, and the check's error relative to
+that from which it replaces it: the mean of models along a curved valley has a curvature that none of them has."""
 
 
 @dataclass(frozen=True)
@@ -350,7 +361,7 @@ class NumbersCheck:
 
         The squares of the error by the references' noise and of the distance from the least-squares solution are added. An estimate of the
         distance, without its noise σ, is step² − σ². A number is not known better than σ, unless the run states its own error. If that is
-        complete, it replaces the check's, which is of another solution, and only steps beyond 3 σ are distances.
+        complete, it replaces one of up to three times its size, which is of another solution, and only steps beyond 3 σ are distances.
 
         Args:
             values: {key: array} at the end of the run.
@@ -362,7 +373,7 @@ class NumbersCheck:
             square, noise, step = (np.square(x) for x in (error, self.noise[key], self.steps[key]))
             own = np.square(known.get(key, 0.0)).reshape(-1)
             if complete and key in known:
-                square = np.where(np.isfinite(square), own, np.inf) + np.maximum(step - _CLEAR**2 * noise, 0.0)
+                square = np.where(square > _OWN**2 * own, square, own) + np.maximum(step - _CLEAR**2 * noise, 0.0)
             else:
                 square = square if key in known else np.maximum(square, noise)
                 square = np.maximum(square + np.maximum(step - noise, 0.0), own)

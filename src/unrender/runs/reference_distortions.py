@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unrender.core.text import listed
 from unrender.display import formatting
 from unrender.statistics import scores
 from unrender.statistics.paired_losses import slices_of_images
 
 if TYPE_CHECKING:
     from unrender.runs.numbers import Numbers
+    from unrender.scene.problem import Problem
 
 AS_IF = "as if the reference of view"
 """Words before a view and what its reference looks like."""
@@ -22,6 +24,19 @@ _EQUAL, _PLATEAU = 1e-3, 16
 _SURE, _OWN, _LEAST_SIDE = 6.0, 0.05, 8
 """Standard errors of an amount from which a distortion is seen; share of its change of the picture that the unknowns must leave; fewest
 pixels of the shorter side of a picture."""
+_ORIENTATIONS = {
+    "mirrored left to right": lambda x: x[:, ::-1],
+    "upside down": lambda x: x[::-1],
+    "turned by 180°": lambda x: x[::-1, ::-1],
+    "turned by 90° counterclockwise": lambda x: np.rot90(x, -1),
+    "turned by 90° clockwise": np.rot90,
+    "mirrored along a diagonal": lambda x: x.swapaxes(0, 1),
+    "mirrored along the other diagonal": lambda x: x[::-1, ::-1].swapaxes(0, 1),
+}
+"""What may have been done to a reference, and the function of an image that undoes it."""
+_BETTER, _CLEARLY, _MOST_VIEWS, _SIDE = 0.5, 0.1, 32, 64
+"""Share of the contrast that another reference may leave, relative to that which the view's own one leaves, and least difference of both
+shares; most views whose references are compared with each other; most pixels of a side of the compared images."""
 _MOSTLY, _BRIGHTER = 0.5, 0.15
 """Share of the squares of a residual from which a distortion that explains them is named; least relative change of brightness."""
 
@@ -100,3 +115,38 @@ def distortion_of_fit(
                 words = f"{AS_IF} {view} {describe(amounts)}" if named else "by what the unknowns do not explain"
                 moves, most = gains @ amounts, explained
     return words, moves
+
+
+def misplaced(problem: Problem, views: Sequence[int], ends: Sequence[Sequence[np.ndarray]]) -> str:
+    """Return words about views whose pictures (H, W, 3) another orientation of their reference, or the reference of another view, fits far
+    better than their own one; "" for none, and where unknowns move what the pictures show. Brightness and offset of each channel are free.
+    """
+    known, found = problem.renderer.parameters(), dict[str, list[int]]()
+    if not all(known[key].brightness or known[key].scattering for key in problem.unknowns):
+        return ""
+    references = [np.asarray(problem.views[view].reference, np.float64) for view in views]
+    for view, images, own in zip(views, ends, references, strict=True):
+        image, weights = np.mean(images, axis=0), problem.test_weights(view, images)
+        others = {f"were {words}": undo(own) for words, undo in _ORIENTATIONS.items()}
+        if len(views) <= _MOST_VIEWS:
+            others |= {f"were that of view {v}": x for v, x in zip(views, references, strict=True) if v != view}
+        left = _unexplained(image, weights, own)
+        shares = {words: _unexplained(image, weights, x) for words, x in others.items() if x.shape == own.shape}
+        words = min(shares, key=lambda words: shares[words], default="")
+        if words and shares[words] < min(_BETTER * left, left - _CLEARLY):
+            found.setdefault(words, []).append(view)
+    return " and ".join(
+        f"{AS_IF}{'s' * (len(of) > 1)} {listed([str(v) for v in of])} {words}" for words, of in found.items()
+    )
+
+
+def _unexplained(image: np.ndarray, weights: np.ndarray, reference: np.ndarray) -> float:
+    """Return the share of the variance of an image (H, W, 3) that a reference leaves, with the best factor and offset of each channel."""
+    step = max(1, -(-max(image.shape[:2]) // _SIDE))
+    x, y, w = (of[::step, ::step] for of in (image, reference, weights[..., None]))
+    w = w * np.isfinite(x + y).all(axis=2, keepdims=True)
+    x, y = (np.where(w > 0.0, of, 0.0) for of in (x, y))
+    x, y = (of - (w * of).sum(axis=(0, 1)) / max(float(w.sum()), 1e-300) for of in (x, y))
+    total, both, squares = ((w * of).sum(axis=(0, 1)) for of in (x * x, x * y, y * y))
+    explained = np.maximum(both, 0.0) ** 2 / np.maximum(squares, 1e-300)
+    return 1.0 - float(explained.sum()) / max(float(total.sum()), 1e-300)
