@@ -63,6 +63,11 @@ def test_a_parameter_without_influence_is_named_and_others_are_not():
         assert undetermined(made, made.initial_values(), 16, 0.0, most=most, sensitivities=seen) == lines[:count]
     late = {"most": 1.0, "sensitivities": seen, "path_seconds": 1.0}  # one test would take longer than there is time
     assert undetermined(made, made.initial_values(), 16, 0.0, **late) == []
+    errors = {
+        keys[2]: np.full(1, 0.1),
+        keys[3]: np.full(1, 0.3),
+    }  # least squares know the first one: precise references
+    assert undetermined(made, made.initial_values(), 16, errors=errors) == lines[1:]
 
 
 @pytest.mark.parametrize(

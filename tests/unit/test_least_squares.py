@@ -388,6 +388,14 @@ def test_the_error_of_a_step_is_at_least_that_of_the_check():
     assert found.unfinished["a"].endswith(
         "standard error 0.004, 0.004, 0.004; give more steps or seconds, or resume the run"
     )
+    for of_b, expected in ((0.5, 0.005), (0.0, 0.004)):  # a number shares a direction that noise hides with another
+        blind = np.array([0.003, 0.0, 0.0, of_b])
+        fit = _Fit(np.zeros((4, 4)), np.full(4, 0.004), np.full(4, 0.004), np.zeros(4), np.zeros((4, 0)), blind)
+        found = _checked(numbers, fit, np.full(4, 0.01))
+        np.testing.assert_allclose(found.errors["a"], [expected, 0.004, 0.004])
+        known = {"a": np.full(3, 0.002)}  # of the run, of other directions
+        shown = found.standard_errors(TRUTH, known, complete=True)["a"]
+        np.testing.assert_allclose(shown, [expected, 0.004, 0.004] if of_b else known["a"], rtol=1e-6)
 
 
 def test_a_rare_bright_sample_that_hides_a_slope_leaves_its_number_without_a_standard_error():

@@ -29,6 +29,8 @@ _LEAST_OF_FACTOR = 0.1
 """Fraction of the change by brighter emitters that must remain with darker reflectances, if the images distinguish the two."""
 _KNOWN = 0.1
 """Standard error, relative to the largest value of a parameter, below which its factor is known."""
+_OF_RANGE = 0.25
+"""Standard error, relative to the range of a parameter, below which the parameter is determined however little it changes the images."""
 _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _MOVED = 0.1
@@ -79,10 +81,11 @@ def undetermined(
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range, or, without one, from its initial values.
 
-    Parameters without a range are tested if their values have moved far, and have no standard errors. Parameters of materials and media
-    are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a parameter change together. If a map
-    such as a bump map hardly changes the images then, its details are tested: a checkerboard of its bounds, or its own values if it has
-    none. If they change the images, only differences of its elements are determined. A map without bounds gets no other line.
+    Parameters without a range are tested if their values have moved far, and have no standard errors; others unless these are small.
+    Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
+    parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
+    bounds, or its own values if it has none. If they change the images, only differences of its elements are determined. A map without
+    bounds gets no other line.
 
     Args:
         values: {key: array}, values of the other parameters.
@@ -105,6 +108,8 @@ def undetermined(
         if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
         ranged = low is not None and high is not None and info.role in _ROLES
+        if ranged and key in errors and (errors[key] < _OF_RANGE * (high - low)).all():
+            continue
         if info.rigid or info.viewpoint or info.welded or not (ranged or (key not in errors and _moved(initial, own))):
             continue
         started = timing.now()

@@ -308,11 +308,13 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     total = np.nan_to_num(fit.covariance[:n, :n], posinf=0.0, neginf=0.0) + fit.unseen @ fit.unseen.T
     along = np.where(error > sizes, np.abs(total) / np.maximum(np.diag(total), 1e-300) * longest, 0.0)
     error = np.maximum(error, along.max(axis=1))
+    if (blind := fit.blind > np.maximum(error, fit.own)).any():  # others share their directions
+        error = np.where(blind, error, np.hypot(error, fit.blind))
     open_ = error > _DOUBTFUL * sizes
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    own = np.where(blind := fit.blind > np.maximum(error, fit.own), np.inf, fit.own)
+    own = np.where(blind, np.inf, fit.own)
     of_step = np.maximum(error, own)  # references without noise leave the noise of this check
     far = np.abs(fit.step) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
     outside = (np.abs(fit.beyond) > least) & ~far  # a step from far away may be too long

@@ -274,7 +274,7 @@ class Numbers:
         ends = self.inside(np.concatenate([self.point + directions.T, self.point - directions.T]))
         halves = [self.pictures(ends, key.fold(half)) for half in (0, 1)]
         one, other = (0.5 * (half[:count] - half[count:]) for half in halves)
-        finite = np.isfinite(one + other).all(axis=(0, 2))[:, None]
+        finite = np.reshape(np.isfinite(one + other).all(axis=(0, 2)), (-1, 1))
         if finite.mean() >= _FINITE:  # the others leave the test
             one, other = np.where(finite, one, 0.0), np.where(finite, other, 0.0)
         return Differences(0.5 * (ends[:count] - ends[count:]).T.astype(np.float64), one, other)
@@ -373,7 +373,8 @@ class NumbersCheck:
             square, noise, step = (np.square(x) for x in (error, self.noise[key], self.steps[key]))
             own = np.square(known.get(key, 0.0)).reshape(-1)
             if complete and key in known:
-                square = np.where(square > _OWN**2 * own, square, own) + np.maximum(step - _CLEAR**2 * noise, 0.0)
+                limit = 1.0 if self.blind else _OWN**2  # the run does not know more of directions that noise hides
+                square = np.where(square > limit * own, square, own) + np.maximum(step - _CLEAR**2 * noise, 0.0)
             else:
                 square = square if key in known else np.maximum(square, noise)
                 square = np.maximum(square + np.maximum(step - noise, 0.0), own)
