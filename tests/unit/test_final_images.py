@@ -490,7 +490,9 @@ def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: s
             renderer=SimpleNamespace(parameters=lambda known=known: {"a": known}), unknowns={"a": None}, views=views,
             test_weights=lambda view, of: np.ones((24, 24)),
         )  # fmt: skip
-        assert misplaced(made, (0, 1), ends) == expected  # type: ignore[arg-type]
+        fitted = [[0.95 * view.reference + 0.05 * of[1] for _ in of] for view, of in zip(views, ends, strict=True)]
+        assert misplaced(made, (0, 1), ends, ends) == expected  # type: ignore[arg-type]
+        assert not misplaced(made, (0, 1), ends, fitted)  # type: ignore[arg-type]
 
 
 def half_textured(reference: np.ndarray | None = None, start: float = 0.5) -> Problem:

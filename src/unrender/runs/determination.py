@@ -107,8 +107,9 @@ def undetermined(
         is_map, bounded = own.ndim >= MAP_AXES, low is not None or high is not None
         if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
-        ranged = low is not None and high is not None and info.role in _ROLES
-        if ranged and key in errors and (errors[key] < _OF_RANGE * (high - low)).all():
+        span = math.inf if low is None or high is None else high - low
+        ranged = span < math.inf and info.role in _ROLES
+        if ranged and key in errors and (errors[key] < _OF_RANGE * span).all():
             continue
         if info.rigid or info.viewpoint or info.welded or not (ranged or (key not in errors and _moved(initial, own))):
             continue

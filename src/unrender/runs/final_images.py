@@ -167,9 +167,9 @@ def render_final_images(
     deviations = {**deviations, **maps.standard_error} if fits else {}
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
-    if result.steps and (words := misplaced(problem, chosen, ends)):
-        differs = differs and replace(differs, explanation=f", {words}{differs.explanation}")
-        lines = [*lines, f"the final pictures look {words}; check the references"]
+    if result.steps and (words := misplaced(problem, chosen, halves_of["initial"], ends)):
+        differs = differs and replace(differs, explanation=f"{differs.explanation}; they look {words}")
+        lines = [*lines, f"the pictures look {words}; check the references"]
     texts, errors_of = (*_named_once(lines, differs), *maps.limited), (deviations, maps.data_share, maps.missing)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 

@@ -117,26 +117,31 @@ def distortion_of_fit(
     return words, moves
 
 
-def misplaced(problem: Problem, views: Sequence[int], ends: Sequence[Sequence[np.ndarray]]) -> str:
-    """Return words about views whose pictures (H, W, 3) another orientation of their reference, or the reference of another view, fits far
-    better than their own one; "" for none, and where unknowns move what the pictures show. Brightness and offset of each channel are free.
+def misplaced(
+    problem: Problem, views: Sequence[int], starts: Sequence[Sequence[np.ndarray]], ends: Sequence[Sequence[np.ndarray]]
+) -> str:
+    """Return words about views of which another orientation of the reference, or the reference of another view, fits the pictures far
+    better; "" for none, and where unknowns move what the pictures show. Brightness and offset of each channel are free.
+
+    The pictures (H, W, 3) of the start tell, since unknowns may have fitted wrong references; those of the end must still differ.
     """
     known, found = problem.renderer.parameters(), dict[str, list[int]]()
     if not all(known[key].brightness or known[key].scattering for key in problem.unknowns):
         return ""
     references = [np.asarray(problem.views[view].reference, np.float64) for view in views]
-    for view, images, own in zip(views, ends, references, strict=True):
-        image, weights = np.mean(images, axis=0), problem.test_weights(view, images)
+    for view, start, end, own in zip(views, starts, ends, references, strict=True):
+        weights = problem.test_weights(view, end)
         others = {f"were {words}": undo(own) for words, undo in _ORIENTATIONS.items()}
         if len(views) <= _MOST_VIEWS:
             others |= {f"were that of view {v}": x for v, x in zip(views, references, strict=True) if v != view}
-        left = _unexplained(image, weights, own)
+        left, after = (_unexplained(np.mean(images, axis=0), weights, own) for images in (start, end))
+        image = np.mean(start, axis=0)
         shares = {words: _unexplained(image, weights, x) for words, x in others.items() if x.shape == own.shape}
         words = min(shares, key=lambda words: shares[words], default="")
-        if words and shares[words] < min(_BETTER * left, left - _CLEARLY):
+        if words and after > _CLEARLY and shares[words] < min(_BETTER * left, left - _CLEARLY):
             found.setdefault(words, []).append(view)
     return " and ".join(
-        f"{AS_IF}{'s' * (len(of) > 1)} {listed([str(v) for v in of])} {words}" for words, of in found.items()
+        f"{AS_IF}{'s' * (len(of) > 1)} {listed([*map(str, of)])} {words}" for words, of in found.items()
     )
 
 
