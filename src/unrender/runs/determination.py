@@ -81,11 +81,10 @@ def undetermined(
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range, or, without one, from its initial values.
 
-    Parameters without a range are tested if their values have moved far, and have no standard errors; others unless these are small.
-    Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
-    parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
-    bounds, or its own values if it has none. If they change the images, only differences of its elements are determined. A map without
-    bounds gets no other line.
+    Parameters without a range are tested if their values have moved far, and have no standard errors; others unless these are small. Those
+    of materials and media are tested while time remains, first those whose sensitivity is 0. All elements of a parameter change together.
+    If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its bounds, or its own values if
+    it has none. If they change the images, only differences of its elements are determined. A map without bounds gets no other line.
 
     Args:
         values: {key: array}, values of the other parameters.
@@ -107,17 +106,14 @@ def undetermined(
         is_map, bounded = own.ndim >= MAP_AXES, low is not None or high is not None
         if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
-        span = math.inf if low is None or high is None else high - low
-        ranged = span < math.inf and info.role in _ROLES
-        if ranged and key in errors and (errors[key] < _OF_RANGE * span).all():
-            continue
+        span = None if low is None or high is None or info.role not in _ROLES else high - low
+        ranged = span is not None and float(np.max(errors.get(key, span))) >= _OF_RANGE * span
         if info.rigid or info.viewpoint or info.welded or not (ranged or (key not in errors and _moved(initial, own))):
             continue
         started = timing.now()
         if longest > 0.0 and started + longest > until[key in unseen]:
             break
-        limits = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)] if ranged else []
-        ends = limits or [own, initial]
+        ends = [project(np.full_like(own, x), low, high) for x in (low, high)] if ranged else [own, initial]
         details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
         first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:

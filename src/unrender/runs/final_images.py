@@ -164,22 +164,22 @@ def render_final_images(
                 maps = of_residuals(problem, result.parameters, halves, known)
     fits, differs = fits and not differs, differs or still
     maps = maps if fits else _untested(problem, result, f"{DIFFERS} by more than noise")
-    deviations = {**deviations, **maps.standard_error} if fits else {}
+    errors_of = {**deviations, **maps.standard_error} if fits else {}, maps.data_share, maps.missing
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
-    if result.steps and (words := misplaced(problem, chosen, halves_of["initial"], ends)):
-        differs = differs and replace(differs, explanation=f"{differs.explanation}; they look {words}")
-        lines = [*lines, f"the pictures look {words}; check the references"]
-    texts, errors_of = (*_named_once(lines, differs), *maps.limited), (deviations, maps.data_share, maps.missing)
+    texts, differs = _named([*lines, *maps.limited], differs, misplaced(problem, chosen, halves_of["initial"], ends))
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 
 
-def _named_once(lines: Sequence[str], differs: Misfit | None) -> list[str]:
-    """Return lines without those that a difference makes superfluous: about a smooth difference, or a distortion of the references if it
-    names one."""
+def _named(lines: Sequence[str], differs: Misfit | None, words: str) -> tuple[tuple[str, ...], Misfit | None]:
+    """Return lines without those that a difference makes superfluous, and the difference; `words` are of `misplaced`."""
+    if words:
+        differs = differs and replace(differs, explanation=f"{differs.explanation}; they look {words}")
+        lines = [*lines, f"the pictures look {words}; check the references"]
     if differs is None or differs.of_samples:  # such noise explains no smooth difference
-        return [*lines]
-    return [line for line in lines if SMOOTH not in line and not (AS_IF in differs.line and AS_IF in line)]
+        return tuple(lines), differs
+    named = AS_IF in differs.line
+    return tuple(line for line in lines if SMOOTH not in line and not (named and AS_IF in line)), differs
 
 
 def _left_out(problem: Problem, result: Result) -> tuple[list[str], dict[str, np.ndarray]]:

@@ -301,15 +301,13 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     posed, longest = numbers.rigid | (numbers.sizes <= 0.0), 2.0 * numbers.limits[: numbers.count]
     sizes = np.where(posed, np.maximum(numbers.sizes, np.minimum(_OF_WIDTHS * widths, longest)), numbers.sizes)
     unseen = np.abs(fit.unseen) > _DOUBTFUL * np.where(posed, longest, sizes)[:, None]
-    hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # uncertainty shared with undetermined numbers
-    error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
+    error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, np.linalg.norm(fit.unseen, axis=1)))  # shared
     n, spread = numbers.count, np.outer(fit.error, fit.error)
     # An open number may be anywhere in its range, and numbers that trade off against it move along.
     total = np.nan_to_num(fit.covariance[:n, :n], posinf=0.0, neginf=0.0) + fit.unseen @ fit.unseen.T
     along = np.where(error > sizes, np.abs(total) / np.maximum(np.diag(total), 1e-300) * longest, 0.0)
-    error = np.maximum(error, along.max(axis=1))
-    if (blind := fit.blind > np.maximum(error, fit.own)).any():  # others share their directions
-        error = np.where(blind, error, np.hypot(error, fit.blind))
+    blind = fit.blind > np.maximum(error := np.maximum(error, along.max(axis=1)), fit.own)
+    error = np.hypot(error, fit.blind * (blind.any() & ~blind))  # others share their directions
     open_ = error > _DOUBTFUL * sizes
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
