@@ -236,10 +236,11 @@ class ScheduleFree(Recipe):
 
     At step t, counted from 0, with the gradient g at the parameters y:
 
-        z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
+        z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r_t) / (t + 1 + r_t)
 
-    The result of a run is y, which is near x. An average has less noise than an iterate, and slowly moving parameters suit estimators
-    that reuse earlier samples. The chain has seven transforms, whose docstrings contain their formulas:
+    with r_t = r, and r (t + 48) / (t + 16) in `preconditioned`. The result of a run is y, which is near x. An average has less noise than
+    an iterate, and slowly moving parameters suit estimators that reuse earlier samples. The chain has seven transforms, whose docstrings
+    contain their formulas:
 
     - `FittedSobolev` smooths the gradients of `preconditioned` by S, whose strength it fits to them.
     - `LastingAgreement` estimates how much of the agreement of gradients is reused noise.
@@ -262,7 +263,7 @@ class ScheduleFree(Recipe):
         beta: β, in [0, 1).
         beta_2: β₂, initial decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
-        averaging: r, >= 0.
+        averaging: r, >= 0; three times as large at first in `preconditioned`.
         growth: q of `AgreementRate`, >= 0; 0 for a rate that never grows.
         decay: p of `AgreementRate`, >= 0; 0 for a rate that never decays.
         schedule: additional factor of every learning rate by step; see `unrender.schedules`.

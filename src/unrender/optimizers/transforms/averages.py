@@ -80,6 +80,10 @@ class DecayingSum(checks.Checked, StepTransform):
 
 _WARMUP = 2
 """Number of steps over which the learning rate increases."""
+_FIRST, _HALF = 3.0, 16
+"""Power r_t of the first steps over r, and number of steps after which half of the difference is left. The first iterates are far from
+the solution. Nine problems with textures, one seed, with 30 steps: 0.93 of the error after 5 steps, 0.97 after 10, 0.98 after 56, at most
+1.05 (`sunlit-vase`). Numbers keep r: Gauss-Newton steps after path gradients come later with it (`PathThenNewton`)."""
 _PROJECTED = 1e-5
 """Difference, relative to the parameter and the first learning rate, above which a parameter counts as projected onto its bounds."""
 
@@ -102,10 +106,11 @@ class Iterates(TransformState):
 class ScheduleFreeAverage(checks.Checked, StepTransform):
     """Take steps on z, average z in x, and place the parameters y between the two. Must be the last transform of a chain.
 
-        z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
+        z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r_t) / (t + 1 + r_t)
 
-    x is the mean of z with weights that grow as t^r. The learning rate is halved at the first step. Iterates z and x are projected onto
-    the bounds together with the parameters. z restarts at x for the parameters in `StepUpdate.restarted`.
+    x is the mean of z with weights that grow as t^r_t. The power r_t is r, and r (t + 48) / (t + 16) for parameters that a `FittedSobolev`
+    smooths, whose x thus forgets the iterates of the first steps soon. The learning rate is halved at the first step. Iterates z and x are
+    projected onto the bounds together with the parameters. z restarts at x for the parameters in `StepUpdate.restarted`.
 
     Args:
         beta: β, in [0, 1).
@@ -121,7 +126,8 @@ class ScheduleFreeAverage(checks.Checked, StepTransform):
         return Iterates(dict(parameters), dict(parameters))
 
     def update(self, update: StepUpdate, state: Iterates) -> tuple[StepUpdate, Iterates]:
-        weight = (1.0 + self.averaging) / (update.made + 1.0 + self.averaging)
+        smoothed = {key for key, change in update.smoothing.items() if change.preconditioner is not None}
+        early = (update.made + _FIRST * _HALF) / (update.made + _HALF)
         warm = replace(update, factor=update.factor * min(1.0, (update.made + 1) / _WARMUP))
         steps: Tree = {}
         fast: Tree = {}
@@ -131,6 +137,8 @@ class ScheduleFreeAverage(checks.Checked, StepTransform):
             before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
             before = mean if key in update.restarted else before
             fast[key] = before + arrays.scalar(-warm.rate(key), direction) * direction
+            power = self.averaging * (early if key in smoothed else 1.0)
+            weight = (1.0 + power) / (update.made + 1.0 + power)
             average[key] = mean + arrays.scalar(weight, direction) * (fast[key] - mean)
             steps[key] = self._between(fast[key], average[key]) - y
         return replace(update, steps=steps), Iterates(fast, average)
