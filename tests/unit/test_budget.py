@@ -17,6 +17,7 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core import timing
 from unrender.estimators.gauss_newton import GaussNewton
+from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.protocols import Callback
@@ -101,14 +102,18 @@ def test_a_long_step_warms_up_once(pause: float, resumed: bool, steps: int, monk
     run.begin_budget(now[0])
     run.resumed = [] if resumed else None
     seconds, _ = loop.warm_up(run)
+    assert run.tracing == pytest.approx(pause if steps == 1 else 0.0)
     assert (len(paused), seconds, run.trial[0]) == (steps, pytest.approx(steps * pause), pytest.approx(pause))
 
 
-@pytest.mark.parametrize(("slower", "left", "tested"), [(1.0, 9.0, True), (1.0, 6.0, False), (9.0, 9.0, False)])
-def test_tests_at_the_end_need_time_on_this_machine(slower: float, left: float, tested: bool) -> None:
-    """Beside ten other jobs, tests took 11 s of a budget of 15 s, whose steps had 6."""
+@pytest.mark.parametrize(
+    ("slower", "left", "tracing", "tested"),
+    [(1.0, 9.0, 2.0, True), (1.0, 6.0, 0.0, False), (9.0, 9.0, 0.0, False), (1.0, 9.0, 4.0, False)],
+)
+def test_tests_at_the_end_need_time_on_this_machine(slower: float, left: float, tracing: float, tested: bool) -> None:
+    """Beside ten other jobs, tests took 11 s of a budget of 15 s, whose steps had 6, and tracing of their kernels 13.5 s."""
     run = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), None, 10.0, 0)
-    run.deadline, run.trial = time.perf_counter() + left, (0.3 * slower, 16 * 8)
+    run.deadline, run.trial, run.tracing = time.perf_counter() + left, (0.3 * slower, 16 * 8), tracing
     assert budget.can_test(run) is tested
 
 
@@ -362,3 +367,44 @@ def test_thinning_keeps_the_records_of_refinements() -> None:
         records = thinned(records[:length])
     assert [r["step"] for r in records if len(r) > 1] == [5, 7]
     assert len(records) < 50
+
+
+@pytest.mark.parametrize(("loss", "options"), [("L2", {"pixels": 4096, "spp": 4}), ("L1", None)])
+def test_large_views_have_mini_batches_where_time_is_short(loss: str, options: dict[str, int] | None) -> None:
+    """With L1 and the noise of few samples, such steps diverged to 2.5 times the error of the start."""
+    truth = {"gain": np.full(1, 0.5)}
+    made = AnalyticRenderer(truth, np.ones((3 * 128 * 128, 1)), 0.1, 0.3, shape=(128, 128))
+    asked = ur.Problem(
+        made, [ur.Parameter("gain", initial=0.2)], [ur.View(made.exact(truth))], loss=getattr(ur.losses, loss)()
+    )
+    cheaper = method("auto").plan(asked).cheaper
+    found = cheaper(0.1) if cheaper else None
+    assert (found and found[1]) == options
+    assert not found or isinstance(found[0].estimator, ur.PathGradient)
+
+
+@pytest.mark.mitsuba  # which a run folder asks for its version
+def test_auto_takes_shorter_steps_where_one_takes_a_fifth_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such runs ended after three steps, with advice. A given spp stays, and so do steps of a budget of steps alone."""
+    now, estimate = [100.0], ur.PathGradient.estimate
+
+    def slowly(self: ur.PathGradient, *arguments: Any) -> Any:
+        now[0] += 0.1 * self.spp
+        return estimate(self, *arguments)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(ur.PathGradient, "estimate", slowly)
+    monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
+    for began, options, spp in ((now[0], {}, 2), (now[0], {"spp": 16}, 16), (None, {}, 16)):
+        plan, folder = method("auto").plan(problem(), options), tmp_path / f"{began}-{len(options)}"
+        annotations = RunAnnotations("auto", began=None if began is None else now[0], choices=plan.lines)
+        found = ur.optimize(problem(), plan, seconds=10, run_directory=folder, annotations=annotations)
+        lines = [line for line in found.warnings if "goes on as with --set spp=2;" in line]
+        assert len(lines) == (spp == 2)
+        assert f"{spp} samples per pixel" in found.choices[0]
+        stored = load_run(folder, steps=found.steps + 1)
+        assert stored.method.estimator["path"]["spp"] == spp  # pyright: ignore[reportArgumentType]
+        assert found.steps >= (20 if spp == 2 else 1)
+        assert resume_run(stored, problem()).steps == found.steps + 1

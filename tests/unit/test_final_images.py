@@ -871,6 +871,19 @@ def test_no_probe_is_made_that_ends_after_the_budget(late: bool) -> None:
     assert any(TOO_SHORT in line for line in found.undetermined) is late
 
 
+@pytest.mark.parametrize(("error", "complete", "told"), [(0.01, True, 0), (0.2, True, 1), (0.01, False, 1)])
+def test_numbers_whose_errors_the_run_knows_share_no_factor_untested(
+    error: float, complete: bool, told: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine a run said that it was too short to test what its own Gauss-Newton matrix shows."""
+    monkeypatch.setattr(determination, "_products", lambda problem: [(["wall"], ["wall"])])
+    made, values = problem(), {"wall": np.full(3, 0.5, np.float32)}
+    known = {"wall": np.full(3, error, np.float32)}
+    result = Result(values, made.initial_values(), [{"samples": 8}], 1.0, 0.0, "seconds", standard_error=known)
+    found = final_images.render_final_images(made, result, 8, tested=False, complete=complete)
+    assert sum("share a factor" in line for line in found.undetermined) == told
+
+
 @pytest.mark.parametrize("of_samples", [True, False])
 def test_a_difference_that_only_may_be_noise_of_the_references_takes_standard_errors_away(
     of_samples: bool, monkeypatch: pytest.MonkeyPatch

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -13,7 +15,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.path import PathGradient
 from unrender.images.base import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.base import Options
+from unrender.methods.base import Options, measured, measuring_once
 from unrender.methods.plan import Plan
 from unrender.methods.rules import RULES
 from unrender.methods.rules.constants import CONSTANTS
@@ -23,6 +25,7 @@ from unrender.methods.smoothed import SIGMA_HELP
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.recipes import ScheduleFree
 from unrender.scene.problem import Problem
+from unrender.scene.render import power_of_two
 
 
 @register(name="auto", position=0)
@@ -36,7 +39,7 @@ class AutoMethod(Options):
     | image | a control variate that forgets after about 20 steps, 33 where noise biases the loss | `image` |
     | the same, scene not loadable twice or moving mesh with an unbiased loss | a new rendering per step | |
     | noise-biased losses | pixels whose noise exceeds their residual are damped | `tolerance` |
-    | samples | 32,768 paths per step, 2 to 16 per pixel | `spp` |
+    | samples | 32,768 paths per step, 2 to 16 per pixel, fewer where a step takes a fifth of the seconds | `spp` |
     | pixels | all of them up to 2¹⁹; beyond, 2¹⁵ per step at 4 samples | `pixels` |
     | smoothing | Sobolev gradients over at most an eighth of a texture, grid or mesh, less where gradients confirm detail | `smooth` |
     | steps | schedule-free Adam; the rate follows the agreement of successive gradients | `learning_rate` |
@@ -95,4 +98,24 @@ class AutoMethod(Options):
         plan = next(plan for rule in RULES if (plan := rule(traits)) is not None)
         plan = replace(plan, reasons=(*plan.reasons, *traits.notes, *exchangeable(traits)))
         few = traits.elements <= CONSTANTS.few_numbers
-        return replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan
+        plan = replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan
+        return plan if self.spp else replace(plan, cheaper=partial(self._cheaper, plan, measured()))
+
+    def _cheaper(self, plan: Plan, known: dict[Any, Any] | None, share: float) -> tuple[Plan, Mapping[str, int]] | None:
+        """Return `Plan.cheaper`: fewer samples per pixel, or else a mini-batch of pixels if noise does not bias the loss."""
+        path = getattr(plan.estimator, "path", plan.estimator)
+        spp, pixels_of_all = getattr(path, "spp", CONSTANTS.spp[0]), plan.problem.pixels
+        options = {"spp": max(power_of_two(int(share * spp)), CONSTANTS.spp[0])}
+        if options["spp"] >= spp:
+            least, batch_spp = CONSTANTS.short_batch
+            paths = power_of_two(int(share * spp * pixels_of_all))
+            options = {"pixels": max(paths // batch_spp, least), "spp": batch_spp}
+            batched = (
+                self.image is None
+                and isinstance(plan.estimator, PathGradient)
+                and isinstance(plan.estimator.pixels, pixels.All)
+            )
+            if not batched or 4 * options["pixels"] > pixels_of_all or not plan.problem.loss.linear:
+                return None
+        with measuring_once(known):
+            return self.model_copy(update=options).plan(plan.problem), options

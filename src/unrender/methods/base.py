@@ -192,13 +192,18 @@ _NUMBER = re.compile(r"\d+(\.\d*)?(e[-+]?\d+)?")
 
 
 @contextmanager
-def measuring_once() -> Iterator[None]:
-    """Render for equal plans once: `measure` keeps its results within this block."""
-    before = _measured.set({})
+def measuring_once(known: dict[Any, Any] | None = None) -> Iterator[None]:
+    """Render for equal plans once: `measure` keeps its results within this block, beside `known` ones of an earlier block."""
+    before = _measured.set({} if known is None else known)
     try:
         yield
     finally:
         _measured.reset(before)
+
+
+def measured() -> dict[Any, Any] | None:
+    """Return the results of `measure` in this block, for `measuring_once`; None outside of one."""
+    return _measured.get()
 
 
 def measure(problem: Any, key: tuple[Hashable, ...], function: Callable[[], Measured]) -> Measured:

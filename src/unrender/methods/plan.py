@@ -36,6 +36,7 @@ class Plan:
         settings: {key: settings of a parameter whose own are None}.
         reasons: Choices and their reasons, one line each.
         other_starts: Keys of unknowns of which other values are compared during a run whose picture differs, see `runs.refinement`.
+        cheaper: Function from a share of the time of a step to another plan with about that, and the options that differ; None without one.
     """
 
     problem: Problem
@@ -44,6 +45,9 @@ class Plan:
     settings: Mapping[str, ParameterSettings] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     other_starts: tuple[str, ...] = ()
+    cheaper: Callable[[float], tuple[Plan, Mapping[str, int]] | None] | None = field(
+        default=None, compare=False, repr=False
+    )
 
     @property
     def lines(self) -> tuple[str, ...]:

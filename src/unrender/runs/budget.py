@@ -21,6 +21,7 @@ from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.truth_check import FEW_NEWTON_STEPS
 
 if TYPE_CHECKING:
+    from unrender.methods.plan import Plan
     from unrender.runs.run import Run
 
 _MOST_SKIPPED = 20
@@ -29,8 +30,8 @@ _FEW_STEPS, _MEASURED = 20, 3
 _LEAST_SPP, _FEW_PIXELS = 2, 4096  # least samples per pixel, and pixels per step, that it advises
 _END_SHARE, _END_UNTESTED, _END_SECONDS = 0.1, 0.05, 1.0
 """Time reserved for verification and final images: a fraction of the budget, less without tests, plus seconds."""
-_TESTED_SHARE, _OF_TESTS = (0.7, 0.3), 1 / 9
-"""Share of the budget that must be left after the warm-up for tests of what the images determine, less if kernels were compiled; and
+_TESTED_SHARE, _OF_TESTS = (0.6, 0.1), 1 / 9
+"""Share of the budget that must be left once kernels are traced for tests of what the images determine, less if kernels were compiled; and
 largest share of the time left for one probe of the images' sensitivity, of which the tests take three at least."""
 _LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
 """Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
@@ -44,6 +45,7 @@ _END_OF_STEPS, LEAST_END, LEAST_NUMBERS = 1 / 3, 1.5, 0.5
 """Most cost of the final pictures and tests of a run without a budget in seconds, relative to that of its steps; its minimum, with .5 a run
 of 80 steps of a wall of 400 texels had no standard errors; and the minimum for the check of few numbers."""
 _OF_STEP = 2  # cost of a path of a step, and launches of a step, relative to a rendering: most steps have an adjoint
+_LONG_SHARE = 0.2  # share of the time for steps that one of them may take
 _MOST_STEPS = 1 << 63  # exclusive limit that the files of a run folder can store
 
 
@@ -112,13 +114,36 @@ def slowdown() -> float:
 
 
 def can_test(run: Run) -> bool:
-    """Return whether a budget in seconds has time for tests at the end, by the time that a step of the warm-up took."""
+    """Return whether a budget in seconds has time for tests at the end, whose kernels take about as long as those of a step to trace and
+    compile, by the times of the warm-up's steps."""
     if run.seconds is None:
         return True
     seconds, samples = run.trial
     probe = seconds_of_probe(run.problem, seconds, _cost_of_steps(samples, 1), 1)
     slow = not run.compiled and probe > _OF_TESTS * run.time_left()
-    return run.time_left() > _TESTED_SHARE[run.compiled] * run.seconds and not slow
+    return run.time_left() - run.tracing > _TESTED_SHARE[run.compiled] * run.seconds and not slow
+
+
+def shorter_steps(run: Run) -> Plan | None:
+    """Return a plan with cheaper steps if one takes more than a fifth of the time left for steps, and add a warning; else None.
+
+    The kernels of these steps are traced again, so there is none if that took longer than a step and half of the time.
+    """
+    if run.deadline is None or run.seconds is None or run.plan.cheaper is None or run.resumed is not None:
+        return None
+    left, (seconds, _) = max(run.time_left() - _end(run), _LEAST_SHARE * run.seconds), run.trial
+    if seconds <= _LONG_SHARE * left or run.tracing > max(0.5 * left, seconds):
+        return None
+    made = run.plan.cheaper(left / (_FEW_STEPS * seconds))
+    if made is None:
+        return None
+    plan, options = made
+    flags = " ".join(f"--set {name}={value}" for name, value in options.items())
+    run.warnings.append(
+        f"a step{' with its tracing' * (run.tracing == seconds)} took {seconds:.2g} s, and all steps have {left:.2g} s, so the run goes on "
+        f"as with {flags}; use more seconds for larger steps"
+    )
+    return plan
 
 
 def seconds_of_steps(result: Result) -> float:

@@ -154,7 +154,7 @@ def render_final_images(
         still = None if differs else differs_still(problem, result, chosen, ends, samples)
         fits = not differs and (still is None or still.of_samples)
         if not tested and result.steps and not differs:
-            lines, deviations = _left_out(problem, result)
+            lines, deviations = _left_out(problem, result, complete)
         if everything:
             end = _Tests(problem, result, weights, left, tests, spent / paths, ends)
             lines, warnings, deviations, unseen = _undetermined(end, known, fits, complete)
@@ -182,10 +182,11 @@ def _named(lines: Sequence[str], differs: Misfit | None, words: str) -> tuple[tu
     return tuple(line for line in lines if SMOOTH not in line and not (named and AS_IF in line)), differs
 
 
-def _left_out(problem: Problem, result: Result) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Return lines about tests that are left out, and the standard errors that need none of them."""
+def _left_out(problem: Problem, result: Result, complete: bool) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return lines about tests that are left out, and the standard errors that need none. Small `complete` ones exclude a shared factor."""
     late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
-    lines = [*untested_factor(problem), *untested_changes(problem), *untested_cells(problem), *late.missing()]
+    factors = without_known(untested_factor(problem), result.parameters, result.standard_error if complete else {})
+    lines = [*factors, *untested_changes(problem), *untested_cells(problem), *late.missing()]
     return lines, _without(result.standard_error, late.unchecked)
 
 
@@ -269,10 +270,8 @@ def _undetermined(
     factors = common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
-    of_numbers = allowed
-    if timing.counts():
-        end = cost_of_end(result.history[-1]["samples"], result.steps, LEAST_NUMBERS)
-        of_numbers = min(max(allowed, _NUMBERS_COUNTED), end)
+    end = cost_of_end(result.history[-1]["samples"], result.steps, LEAST_NUMBERS)
+    of_numbers = min(max(allowed, _NUMBERS_COUNTED), end) if timing.counts() else allowed
     given = of_numbers, sensitivities, tests.weights, stated, dict(enumerate(tests.ends))
     numbers = check_numbers(problem, result.parameters, result.initial, *given)
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))

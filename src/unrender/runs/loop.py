@@ -27,7 +27,9 @@ from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Measuring
+from unrender.runs.budget import shorter_steps
 from unrender.runs.callbacks import COMPILING
+from unrender.runs.metadata import described, first_values
 from unrender.runs.result import Result
 from unrender.runs.run import GradientNoise, Run, RunState, interruptible
 from unrender.runs.watches import remarks
@@ -82,6 +84,11 @@ def descend(run: Run) -> Result:
         fresh = run.snapshot()
         with phases.phase(COMPILING):
             seconds, warm = warm_up(run)
+            if (plan := shorter_steps(run)) is not None:
+                _adopt(run, plan)
+                fresh, spent = run.snapshot(), seconds
+                seconds, warm = warm_up(run)
+                seconds += spent
         run.warmup_seconds += seconds
         for callback in callbacks:
             callback.on_warm_up(run, fresh, warm)
@@ -110,6 +117,15 @@ def descend(run: Run) -> Result:
     return result
 
 
+def _adopt(run: Run, plan: Plan) -> None:
+    """Continue a run, before its first step, by another plan for its problem."""
+    made = prepare(plan, run.steps, run.seconds, run.seed)
+    run.plan, run.problem, run.estimator, run.optimizer = made.plan, made.problem, made.estimator, made.optimizer
+    run.parameters, run.state, run.initial = made.parameters, made.state, first_values(made)
+    run.description |= described(run)
+    run.replanned = True
+
+
 def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
     """Compile every kernel of a step by steps whose results are discarded. Return the elapsed seconds, and the snapshot after them.
 
@@ -118,6 +134,7 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
     started, kernels, whole = time.perf_counter(), cache.kernels_changed(), run
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
     state = run.state
+    trials: list[tuple[float, int]] = []
     for _ in range(WARM_UP_STEPS):
         began = time.perf_counter()
         estimate, state.estimator = run.estimator.estimate(
@@ -132,9 +149,15 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         memory.evaluate_in_turn(state.optimizer)
         _gradient_noise(run, estimate)
         whole.trial = time.perf_counter() - began, int(estimate.info.get("samples", 0))
+        trials.append(whole.trial)
         is_long = run.deadline is not None and whole.trial[0] > _LONG_STEP * (run.seconds or math.inf)
+        is_long &= (
+            run.plan.cheaper is None or whole.trial[0] > run.time_left()
+        )  # otherwise it is measured without tracing
         if is_long and kernels == cache.kernels_changed() and run.resumed is None:
             break
+    (first, paths), (last, own) = trials[0], trials[-1]  # the first may trace more paths
+    whole.tracing = max(first - last * paths / max(own, 1), 0.0) if len(trials) > 1 else first
     return time.perf_counter() - started, run.snapshot()
 
 

@@ -83,6 +83,17 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
     }
 
 
+def described(run: Run) -> dict[str, Any]:
+    """Return the fields of `describe_run` that another plan for the problem changes."""
+    before, parts = run.description, {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
+    known = {"fingerprint": fingerprint_of(run)} if "fingerprint" in before["problem"] else {}
+    return {
+        "settings": {**before["settings"], **parts},
+        "choices": list(run.plan.lines),
+        "problem": {**before["problem"], **known},
+    }
+
+
 def recorded_measures(problem: Problem) -> dict[str, Any]:
     """Return the error measures as recorded in a run folder, without the default ones."""
     return {key: u.measure.record() for key, u in problem.unknowns.items() if u.measure != PLAIN}

@@ -56,6 +56,8 @@ class Run:
         before: seconds of the budget before the first step.
         grace: seconds after the deadline at which the end of the run may still be busy.
         trial: seconds and samples of the last step of the warm-up.
+        replanned: whether the plan has been replaced by one with shorter steps, see `budget.shorter_steps`.
+        tracing: seconds by which the first step of the warm-up took longer than the last one with as many paths; all of it for one step.
         compiled: whether the warm-up has added kernels to the cache.
         tested: whether the budget has time for tests at the end, whose kernels the warm-up has then compiled.
     """
@@ -89,6 +91,8 @@ class Run:
     before: float = 0.0
     grace: float = math.inf
     trial: tuple[float, int] = (0.0, 0)
+    replanned: bool = False
+    tracing: float = 0.0
     compiled: bool = False
     tested: bool = True
 

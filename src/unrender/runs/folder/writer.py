@@ -156,7 +156,10 @@ class RunWriter(Callback):
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
+        """Compile the kernels of the final pictures, so that nothing compiles after the last step. Write another plan of the run."""
+        if run.replanned:
+            self.method = method_file.serialize(run, self.method["name"], self.checkpoint_every, self.final_spp)
+            self.start(run.result())
         if self.final_spp != 1 and not run.stopped:
             run.tested = can_test(run)
             with phases.phase(callbacks.COMPILING):
