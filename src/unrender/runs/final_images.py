@@ -270,8 +270,9 @@ def _undetermined(
     factors = common_factor(problem, result.parameters, spp, within(seconds), per_pass, within(most))
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * seconds_of_steps(result), _LEAST_SECONDS), 2.0 * most)
-    end = cost_of_end(result.history[-1]["samples"], result.steps, LEAST_NUMBERS)
-    of_numbers = min(max(allowed, _NUMBERS_COUNTED), end) if timing.counts() else allowed
+    of_numbers, most_of_numbers = allowed, max(allowed, _NUMBERS_COUNTED)
+    if timing.counts():
+        of_numbers = min(most_of_numbers, cost_of_end(result.history[-1]["samples"], result.steps, LEAST_NUMBERS))
     given = of_numbers, sensitivities, tests.weights, stated, dict(enumerate(tests.ends))
     numbers = check_numbers(problem, result.parameters, result.initial, *given)
     deviations = _without(stated, (*numbers.unchecked, *numbers.elsewhere))
