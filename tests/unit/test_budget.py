@@ -18,6 +18,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core import timing
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.methods import method
+from unrender.methods.auto import AutoMethod
 from unrender.methods.plan import Plan
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.protocols import Callback
@@ -369,18 +370,51 @@ def test_thinning_keeps_the_records_of_refinements() -> None:
     assert len(records) < 50
 
 
+def large_view(loss: str) -> ur.Problem:
+    truth = {"gain": np.full(1, 0.5)}
+    made = AnalyticRenderer(truth, np.ones((3 * 128 * 128, 1)), 0.1, 0.3, shape=(128, 128))
+    view = ur.View(made.exact(truth))
+    return ur.Problem(made, [ur.Parameter("gain", initial=0.2)], [view], loss=getattr(ur.losses, loss)())
+
+
 @pytest.mark.parametrize(("loss", "options"), [("L2", {"pixels": 4096, "spp": 4}), ("L1", None)])
 def test_large_views_have_mini_batches_where_time_is_short(loss: str, options: dict[str, int] | None) -> None:
     """With L1 and the noise of few samples, such steps diverged to 2.5 times the error of the start."""
-    truth = {"gain": np.full(1, 0.5)}
-    made = AnalyticRenderer(truth, np.ones((3 * 128 * 128, 1)), 0.1, 0.3, shape=(128, 128))
-    asked = ur.Problem(
-        made, [ur.Parameter("gain", initial=0.2)], [ur.View(made.exact(truth))], loss=getattr(ur.losses, loss)()
-    )
+    asked = large_view(loss)
     cheaper = method("auto").plan(asked).cheaper
+    assert (cheaper is None) == (options is None)  # a run without other steps warms up once if they are long
     found = cheaper(0.1) if cheaper else None
     assert (found and found[1]) == options
     assert not found or isinstance(found[0].estimator, ur.PathGradient)
+
+
+@pytest.mark.parametrize(
+    ("name", "loss", "estimator", "told"),
+    [
+        ("auto", "L2", ur.PathGradient(spp=2), True),
+        ("auto", "L1", ur.PathGradient(spp=2), False),
+        ("auto", "L2", GaussNewton(), False),
+        ("auto", "L2", ur.PathGradient(pixels=ur.pixels.Uniform(4096)), False),
+        ("plain", "L2", ur.PathGradient(spp=2), False),
+    ],
+)
+def test_mini_batches_are_advised_where_they_are_an_option_and_converge(
+    name: str, loss: str, estimator: Any, told: bool
+) -> None:
+    """With L1, a run that took this advice ended at 2.5 times the error of its start; other methods refused the option."""
+    optimizer = AveragedNewton() if isinstance(estimator, GaussNewton) else ur.optimizers.Adam(0.1)
+    run = loop.prepare(Plan(large_view(loss), estimator, optimizer), None, 10.0, 0)
+    run.step, run.clock, run.description = 3, 6.0, {"method": name}
+    budget._warn_of_few_steps(run)
+    assert ["--set pixels=4096" in line for line in run.warnings] == [told]
+
+
+def test_derivative_images_get_no_shorter_by_samples_of_images() -> None:
+    """A run of a pose went on with smoothed gradients, since a trial of four samples could not tell its derivative images from noise."""
+    plan, options = Plan(large_view("L2"), GaussNewton(), AveragedNewton()), method("auto").configure({})
+    assert isinstance(options, AutoMethod)
+    assert options._shorter(plan, 0.1) is None
+    assert options._shorter(replace(plan, estimator=ur.PathGradient(spp=16)), 0.1) == {"spp": 2}
 
 
 @pytest.mark.mitsuba  # which a run folder asks for its version
@@ -397,10 +431,11 @@ def test_auto_takes_shorter_steps_where_one_takes_a_fifth_of_the_time(
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(ur.PathGradient, "estimate", slowly)
     monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
-    for began, options, spp in ((now[0], {}, 2), (now[0], {"spp": 16}, 16), (None, {}, 16)):
-        plan, folder = method("auto").plan(problem(), options), tmp_path / f"{began}-{len(options)}"
+    cases = (now[0], {}, 2, None), (now[0], {"spp": 16}, 16, None), (None, {}, 16, None), (now[0], {}, 16, 2)
+    for began, options, spp, steps in cases:  # of which two long ones fit into the time
+        plan, folder = method("auto").plan(problem(), options), tmp_path / f"{began}-{len(options)}-{steps}"
         annotations = RunAnnotations("auto", began=None if began is None else now[0], choices=plan.lines)
-        found = ur.optimize(problem(), plan, seconds=10, run_directory=folder, annotations=annotations)
+        found = ur.optimize(problem(), plan, steps=steps, seconds=10, run_directory=folder, annotations=annotations)
         lines = [line for line in found.warnings if "goes on as with --set spp=2;" in line]
         assert len(lines) == (spp == 2)
         assert f"{spp} samples per pixel" in found.choices[0]

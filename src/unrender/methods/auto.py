@@ -99,23 +99,27 @@ class AutoMethod(Options):
         plan = replace(plan, reasons=(*plan.reasons, *traits.notes, *exchangeable(traits)))
         few = traits.elements <= CONSTANTS.few_numbers
         plan = replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan
-        return plan if self.spp else replace(plan, cheaper=partial(self._cheaper, plan, measured()))
+        shorter = self._shorter(plan, 0.0)
+        return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan
+
+    def _shorter(self, plan: Plan, share: float) -> Mapping[str, int] | None:
+        """Return options with which path gradients take about a share of the time: fewer samples per pixel, or else a mini-batch of pixels
+        if noise does not bias the loss. None without such options, as for Gauss-Newton steps, which take at least half of the time then."""
+        path = getattr(plan.estimator, "path", plan.estimator)
+        if self.spp or not isinstance(path, PathGradient):
+            return None
+        if (spp := max(power_of_two(int(share * path.spp)), CONSTANTS.spp[0])) < path.spp:
+            return {"spp": spp}
+        (least, batch_spp), count = CONSTANTS.short_batch, plan.problem.pixels
+        drawn = max(power_of_two(int(share * path.spp * count)) // batch_spp, least)
+        batched = self.image is None and path is plan.estimator and isinstance(path.pixels, pixels.All)
+        suits = batched and 4 * drawn <= count and plan.problem.loss.linear
+        return {"pixels": drawn, "spp": batch_spp} if suits else None
 
     def _cheaper(self, plan: Plan, known: dict[Any, Any] | None, share: float) -> tuple[Plan, Mapping[str, int]] | None:
-        """Return `Plan.cheaper`: fewer samples per pixel, or else a mini-batch of pixels if noise does not bias the loss."""
-        path = getattr(plan.estimator, "path", plan.estimator)
-        spp, pixels_of_all = getattr(path, "spp", CONSTANTS.spp[0]), plan.problem.pixels
-        options = {"spp": max(power_of_two(int(share * spp)), CONSTANTS.spp[0])}
-        if options["spp"] >= spp:
-            least, batch_spp = CONSTANTS.short_batch
-            paths = power_of_two(int(share * spp * pixels_of_all))
-            options = {"pixels": max(paths // batch_spp, least), "spp": batch_spp}
-            batched = (
-                self.image is None
-                and isinstance(plan.estimator, PathGradient)
-                and isinstance(plan.estimator.pixels, pixels.All)
-            )
-            if not batched or 4 * options["pixels"] > pixels_of_all or not plan.problem.loss.linear:
-                return None
+        """Return `Plan.cheaper`; None if noise changes the kind of the steps."""
+        if (options := self._shorter(plan, share)) is None:
+            return None
         with measuring_once(known):
-            return self.model_copy(update=options).plan(plan.problem), options
+            made = self.model_copy(update=dict(options)).plan(plan.problem)
+        return (made, options) if type(made.estimator) is type(plan.estimator) else None

@@ -14,7 +14,10 @@ from unrender.backend import cache
 from unrender.core import checks, timing
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
+from unrender.estimators.path import PathGradient
+from unrender.methods import methods
 from unrender.optimizers.averaged_newton import AveragedNewton
+from unrender.pixels import All, Uniform
 from unrender.runs.callbacks import Callback
 from unrender.runs.image_sensitivity import seconds_of_probe
 from unrender.runs.result import NON_FINITE, Result
@@ -127,14 +130,16 @@ def can_test(run: Run) -> bool:
 def shorter_steps(run: Run) -> Plan | None:
     """Return a plan with cheaper steps if one takes more than a fifth of the time left for steps, and add a warning; else None.
 
-    The kernels of these steps are traced again, so there is none if that took longer than a step and half of the time.
+    There is none if the steps that were asked for fit into this time. The kernels of these steps are traced again, so there is none either
+    if that took longer than a step and half of the time.
     """
     if run.deadline is None or run.seconds is None or run.plan.cheaper is None or run.resumed is not None:
         return None
     left, (seconds, _) = max(run.time_left() - _end(run), _LEAST_SHARE * run.seconds), run.trial
-    if seconds <= _LONG_SHARE * left or run.tracing > max(0.5 * left, seconds):
+    wanted = min(run.steps or _FEW_STEPS, _FEW_STEPS)
+    if seconds <= max(_LONG_SHARE, 1.0 / wanted) * left or run.tracing > max(0.5 * left, seconds):
         return None
-    made = run.plan.cheaper(left / (_FEW_STEPS * seconds))
+    made = run.plan.cheaper(left / (wanted * seconds))
     if made is None:
         return None
     plan, options = made
@@ -168,11 +173,21 @@ def _warn_of_few_steps(run: Run) -> None:
         return
     expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
     needed = FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else _FEW_STEPS
-    spp, large = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
+    spp, large = getattr(run.estimator, "spp", None), _suits_mini_batches(run)
     spp, steps = spp if isinstance(spp, int) else None, max(expected, run.step)
     line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run, needed), needed, run.before)
     run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
     run.few_steps = line
+
+
+def _suits_mini_batches(run: Run) -> bool:
+    """Return whether fewer pixels a step are an option of the method, and noise does not bias the loss: else mini-batches diverge."""
+    known = methods().get(run.description.get("method", ""))
+    sampler = run.estimator.pixels if isinstance(run.estimator, PathGradient) else None
+    count = sampler.count if isinstance(sampler, Uniform) else run.problem.pixels if isinstance(sampler, All) else 0
+    return (
+        count > _FEW_PIXELS and run.problem.loss.linear and known is not None and "pixels" in known.options.model_fields
+    )
 
 
 def _enough(run: Run, needed: int) -> float:
@@ -200,7 +215,7 @@ def few_steps(
         seconds, steps, most: the budget, the steps that it allows, and the steps that were requested.
         spp: samples per pixel of a step, of which it advises a quarter, at least 2, since gradients without bias need two groups of
             samples; None if unknown.
-        large: whether the views have more pixels than the number that it advises per step.
+        large: whether to advise a number of pixels per step.
         enough: seconds that the needed steps need; None if unknown.
         needed: number of steps; Gauss-Newton steps of all unknowns need fewer.
         before: seconds of the budget before the first step.
