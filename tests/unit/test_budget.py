@@ -16,6 +16,8 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core import timing
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import BlockEstimate
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.methods import method
 from unrender.methods.auto import AutoMethod
@@ -29,6 +31,8 @@ from unrender.runs.image_sensitivity import curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.resume import load_run, resume_run
 from unrender.runs.run import Run
+from unrender.runs.watches import InfluenceWatch
+from unrender.scene import serialization
 
 TRUTH = {"gain": np.full(2, 0.5)}
 
@@ -331,6 +335,18 @@ def test_dim_pictures_whose_gradient_is_below_epsilon_are_told(scale: float) -> 
     assert all("below the optimizer's epsilon of 1e-08" in line for line in told)
 
 
+@pytest.mark.parametrize("of_block", [False, True])
+def test_gauss_newton_steps_of_small_gradients_are_not_short(of_block: bool) -> None:
+    """The steps of a pose, which have no epsilon, were said to be short where Adam's epsilon for a texture was larger."""
+    optimizer = ur.optimizers.Partitioned(("gain",), AveragedNewton(), ur.optimizers.Adam(0.01))
+    run = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), 9, None, 0)
+    run.optimizer, watch, gradient = optimizer, InfluenceWatch(), {"gain": np.full(2, 1e-10)}
+    block = (BlockEstimate(("gain",), Estimate(0.0, gradient)),) if of_block else ()
+    for run.step in range(1, 6):
+        watch.on_update(run, Estimate(0.0, gradient, block), True)
+    assert ["below the optimizer's epsilon" in line for line in run.warnings] == [True] * (not of_block)
+
+
 def test_the_plan_of_another_problem_is_refused() -> None:
     """The optimizer of a plan in a file names parameters; a run folder whose problem has got other keys has such a plan."""
     optimizer = ur.optimizers.ScheduleFree(preconditioner=ur.preconditioners.Sobolev(), preconditioned=("wall.data",))
@@ -422,7 +438,8 @@ def test_auto_takes_shorter_steps_where_one_takes_a_fifth_of_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such runs ended after three steps, with advice. A given spp stays, and so do steps of a budget of steps alone."""
-    now, estimate = [100.0], ur.PathGradient.estimate
+    now, estimate, save, saved = [100.0], ur.PathGradient.estimate, serialization.save, []
+    monkeypatch.setattr(serialization, "save", lambda *of: (saved.append(of), save(*of)))
 
     def slowly(self: ur.PathGradient, *arguments: Any) -> Any:
         now[0] += 0.1 * self.spp
@@ -443,3 +460,4 @@ def test_auto_takes_shorter_steps_where_one_takes_a_fifth_of_the_time(
         assert stored.method.estimator["path"]["spp"] == spp  # pyright: ignore[reportArgumentType]
         assert found.steps >= (20 if spp == 2 else 1)
         assert resume_run(stored, problem()).steps == found.steps + 1
+    assert len(saved) == len(cases)  # references may be large

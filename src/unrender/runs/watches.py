@@ -78,14 +78,15 @@ class InfluenceWatch(Callback):
             return
         zero, steps = run.state.zero_gradient, self._steps
         block = estimate.get(BlockEstimate)
-        waiting = block.keys if block is not None and block.estimate is None else ()
+        of_block = () if block is None else block.keys  # whose optimizer has no ε
+        waiting = of_block if block is not None and block.estimate is None else ()
         epsilon = max(
             (part.epsilon for part in parts(run.optimizer) if type(part) in (Adam, ScheduleFree)), default=0.0
         )
         for key, gradient in estimate.gradient.items():
             norm = _norm(gradient)
             zero[key] = zero[key] and key not in waiting and norm == 0.0
-            self._small[key] = self._small.get(key, True) and key not in waiting and 0.0 < norm < epsilon
+            self._small[key] = self._small.get(key, True) and key not in of_block and 0.0 < norm < epsilon
             if zero[key] and run.step == steps:
                 run.warnings.append(
                     f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"

@@ -159,7 +159,10 @@ class RunWriter(Callback):
         """Compile the kernels of the final pictures, so that nothing compiles after the last step. Write another plan of the run."""
         if run.replanned:
             self.method = method_file.serialize(run, self.method["name"], self.checkpoint_every, self.final_spp)
-            self.start(run.result())
+            try:
+                self._write_method(run.result())
+            except OSError as error:
+                raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
         if self.final_spp != 1 and not run.stopped:
             run.tested = can_test(run)
             with phases.phase(callbacks.COMPILING):
@@ -278,6 +281,10 @@ class RunWriter(Callback):
 
     def _write_start(self, result: Result) -> None:
         self.save_problem(self.folder)
+        self._write_method(result)
+
+    def _write_method(self, result: Result) -> None:
+        """Write all initial files that depend on the method."""
         files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD), name_too=False)
         contents.write_arrays(self.folder, result, (INITIAL, TRUTH, MESHES, PARAMETERS))
         self._history.rewrite(result.history, name_too=False)
