@@ -424,6 +424,7 @@ def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step(
         warnings=[],
         state=SimpleNamespace(zero_gradient={key: True}, hidden={}),
         estimator=ur.PathGradient(pixels=Views(1)),
+        optimizer=ur.optimizers.Adam(),
     )
     mesh, influence = MeshWatch(), InfluenceWatch()
     for run.step in range(1, 161):

@@ -139,7 +139,7 @@ class GaussNewton:
         derivative_noise: noise of mean derivative images, relative to the derivatives, above which every step has new ones if they are
             averaged, > 0. It also multiplies the references' noise, which no image reduces.
         scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
-            `MOST_AVERAGED` pixels in all views have no scores, since mean and anchor take 48 bytes per pixel. Runs whose optimizer states no
+            `MOST_AVERAGED` pixels in all views have no scores, since the means take 48 bytes per pixel. Runs whose optimizer states no
             errors do without.
         derivative_images: whether those of all views are returned (`DerivativeImages`), which takes 12 bytes per pixel and element.
     """
