@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -493,6 +494,35 @@ def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: s
         fitted = [[0.95 * view.reference + 0.05 * of[1] for _ in of] for view, of in zip(views, ends, strict=True)]
         assert misplaced(made, (0, 1), ends, ends) == expected  # type: ignore[arg-type]
         assert not misplaced(made, (0, 1), ends, fitted)  # type: ignore[arg-type]
+
+
+def misplaced_among(references: list[np.ndarray], images: list[np.ndarray], weights: np.ndarray) -> str:
+    made: Any = SimpleNamespace(
+        renderer=SimpleNamespace(parameters=lambda: {"a": ParameterInfo((), brightness="reflectance")}),
+        unknowns={"a": None}, views=[SimpleNamespace(reference=x) for x in references], test_weights=lambda *of: weights,
+    )  # fmt: skip
+    pictures = [[x, x] for x in images]
+    return misplaced(made, range(len(images)), pictures, pictures)
+
+
+@pytest.mark.parametrize(("side", "shown"), [(3, 3), (24, 3), (192, 9), (8, 8)])
+def test_noise_of_few_pixels_looks_like_no_other_reference(side: int, shown: int) -> None:
+    """A converged run of a plain wall in 3 x 3 pixels was said to look as if its reference were upside down."""
+    random, weights = np.random.default_rng(5), np.zeros((side, side))
+    weights[:shown, :shown] = 1.0
+    for _ in range(40):
+        one, other = 0.5 + 0.01 * random.normal(size=(2, side, side, 1)) * np.ones(3)
+        assert not misplaced_among([one], [other], weights)
+
+
+def test_references_of_many_views_are_not_copied_at_once() -> None:
+    """They took three times the memory of all references for a moment."""
+    pictures = list(np.random.default_rng(6).random((40, 128, 128, 3), np.float32))
+    tracemalloc.start()
+    assert not misplaced_among(pictures, pictures, np.ones((128, 128)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.5 * sum(x.nbytes for x in pictures)
 
 
 def half_textured(reference: np.ndarray | None = None, start: float = 0.5) -> Problem:

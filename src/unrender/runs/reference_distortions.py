@@ -128,9 +128,13 @@ def misplaced(
     known, found = problem.renderer.parameters(), dict[str, list[int]]()
     if not all(known[key].brightness or known[key].scattering for key in problem.unknowns):
         return ""
-    references = [np.asarray(problem.views[view].reference, np.float64) for view in views]
+    references = [np.asarray(problem.views[view].reference) for view in views]
     for view, start, end, own in zip(views, starts, ends, references, strict=True):
         weights = problem.test_weights(view, end)
+        if (
+            np.count_nonzero(_thinned(weights)) < _LEAST_SIDE**2
+        ):  # noise of so few pixels resembles another one by chance
+            continue
         others = {f"were {words}": undo(own) for words, undo in _ORIENTATIONS.items()}
         if len(views) <= _MOST_VIEWS:
             others |= {f"were that of view {v}": x for v, x in zip(views, references, strict=True) if v != view}
@@ -147,11 +151,16 @@ def misplaced(
 
 def _unexplained(image: np.ndarray, weights: np.ndarray, reference: np.ndarray) -> float:
     """Return the share of the variance of an image (H, W, 3) that a reference leaves, with the best factor and offset of each channel."""
-    step = max(1, -(-max(image.shape[:2]) // _SIDE))
-    x, y, w = (of[::step, ::step] for of in (image, reference, weights[..., None]))
+    x, y, w = (_thinned(of).astype(np.float64) for of in (image, reference, weights[..., None]))
     w = w * np.isfinite(x + y).all(axis=2, keepdims=True)
     x, y = (np.where(w > 0.0, of, 0.0) for of in (x, y))
     x, y = (of - (w * of).sum(axis=(0, 1)) / max(float(w.sum()), 1e-300) for of in (x, y))
     total, both, squares = ((w * of).sum(axis=(0, 1)) for of in (x * x, x * y, y * y))
     explained = np.maximum(both, 0.0) ** 2 / np.maximum(squares, 1e-300)
     return 1.0 - float(explained.sum()) / max(float(total.sum()), 1e-300)
+
+
+def _thinned(image: np.ndarray) -> np.ndarray:
+    """Return every pixel of a small image, and every few of a larger one."""
+    step = max(1, -(-max(image.shape[:2]) // _SIDE))
+    return image[::step, ::step]
