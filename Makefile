@@ -65,7 +65,7 @@ asset: .venv/ready
 	@echo "held-out photographs beside renders: file://$(CURDIR)/out/asset/judge/sheet.png; the asset: out/asset/export"
 
 test: .venv/ready
-	$(call WITH_LINT,-m "not slow" -o faulthandler_timeout=150)
+	$(call WITH_LINT,-m "not slow" -o faulthandler_timeout=400)
 
 test-all: .venv/ready
 	$(call WITH_LINT,)

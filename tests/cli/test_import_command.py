@@ -378,7 +378,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
         "frames[2]: transform_matrix: expected",
     ),
     "no matrix": (_frame("transform_matrix", None), "frames[2]: transform_matrix: expected a matrix"),
-    "NaN": (_frame("transform_matrix", [[float("nan")] * 4] * 4), "frames[2]: transform_matrix: expected a matrix"),
+    "NaN": (
+        _frame("transform_matrix", [[float("nan")] * 4] * 4),
+        "matrix: expected a matrix of finite numbers, got nan",
+    ),
     "a shear": (_frame("transform_matrix", [[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "columns are not a rotation"),
     "a mirror": (_frame("transform_matrix", np.diag([1, 1, -1, 1]).tolist()), "one axis is mirrored"),
     "a focal length of 0": (_top("fl_x", 0), "fx: expected a focal length in pixels, got 0"),

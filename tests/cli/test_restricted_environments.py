@@ -52,6 +52,22 @@ def test_no_home_and_no_name(tmp_path: Path) -> None:
     assert (done.returncode, told) == (0, [])
 
 
+@pytest.mark.parametrize(
+    ("words", "output"),
+    [("methods", ">&-"), ("methods --set a=1", "2>&-"), ("gallery", "| cat")],
+)
+def test_an_output_that_is_closed_or_lacks_characters(words: str, output: str, tmp_path: Path) -> None:
+    """Both were tracebacks, of a run when it was over."""
+    ascii_alone = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    line = f"set -o pipefail; {sys.executable} -m unrender.app.cli.main {words} {output}"
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=tmp_path, env=os.environ | ascii_alone, capture_output=True, timeout=300
+    )
+    refused = words not in ("methods", "gallery")
+    assert (done.returncode, done.stdout != b"") == (2 * refused, words == "gallery")
+    assert done.stderr.count(b"\n") == (refused and "2>" not in output), done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("home", quick(["missing", "file"], "missing"))
 def test_a_home_that_cannot_be_written(tmp_path: Path, home: str) -> None:

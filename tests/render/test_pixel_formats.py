@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 import unrender as ur
 from tiers import quick
@@ -70,6 +72,25 @@ def test_a_file_that_calls_values_of_an_xyz_film_rgb_is_refused(pixel_format: st
     mi.Bitmap(rendered(pixel_format)).write(str(tmp_path / "reference.exr"))
     with pytest.raises(ur.InputError, match=r"the file names its channels R, G and B.*pixel_format is xyz"):
         problem(pixel_format, tmp_path / "reference.exr")
+
+
+@pytest.mark.parametrize("of", ["array", "PIL", "torch"])
+def test_bytes_are_srgb_for_an_xyz_film_too(of: str) -> None:
+    """Pictures of PIL and PyTorch, whose kind of number is not told as NumPy's, were converted as if they were XYZ."""
+    given: Any = np.tile(np.array([200, 120, 60], np.uint8), (6, 6, 1))
+    expected = np.asarray(problem("rgb", given).views[0].reference)
+    if of == "PIL":
+        given = Image.fromarray(given)
+    elif of == "torch":
+        given = pytest.importorskip("torch").tensor(given)
+    np.testing.assert_allclose(np.asarray(problem("xyz", given).views[0].reference), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("file", [io.BytesIO(b"x"), io.StringIO("x")])
+def test_an_open_file_is_refused_in_one_line(file: Any) -> None:
+    """It has a method `detach`, as a tensor of PyTorch has."""
+    with pytest.raises(ur.InputError, match="view 0: reference: "):
+        problem("rgb", file)
 
 
 def test_gradients_of_luminance_are_those_of_the_weighted_channels() -> None:

@@ -315,6 +315,7 @@ def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatc
         (None, math.inf, "seconds must be positive and finite, got inf"),
         (None, math.nan, "seconds must be positive and finite, got nan"),
         (None, True, "seconds must be positive and finite, got True"),
+        (None, 10**400, "seconds must be positive and finite, got 1000"),
         (None, "5", "seconds must be positive and finite, got '5'"),
     ],
 )

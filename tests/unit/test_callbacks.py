@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -162,7 +163,23 @@ def test_a_callback_may_add_arrays_to_the_history_and_return_nothing(tmp_path: P
     assert (record["psnr"], record["sizes"], record["thing"]) == (1.5, [1.0, None], repr(Path))
 
 
-@pytest.mark.parametrize("folder", ["", 5])
+@pytest.mark.parametrize("folder", ["", 5, None])
 def test_what_is_no_folder_is_refused(folder: Any) -> None:
-    with pytest.raises(ur.InputError, match="run_directory: expected a folder, got"):
-        ur.optimize(problem(), ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=1, run_directory=folder)
+    def run(**of: Any) -> ur.Result:
+        return ur.optimize(problem(), ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=1, **of)
+
+    result = run()
+    calls: list[Callable[[], Any]] = [
+        lambda: result.save(folder),
+        lambda: ur.resume(folder),
+        lambda: ur.app.judge(folder),
+    ]
+    calls += [
+        lambda: ur.Problem.from_file(folder),
+        lambda: ur.app.turntable(".", folder),
+        lambda: ur.app.export(".", folder),
+    ]
+    calls += [] if folder is None else [lambda: run(run_directory=folder)]
+    for call in calls:
+        with pytest.raises(ur.InputError, match=f": expected a [a-z ]+, got {folder!r}$"):
+            call()

@@ -144,7 +144,8 @@ def test_of_many_values_outside_the_bounds_the_furthest_is_named() -> None:
 @pytest.mark.parametrize(
     ("bounds", "kept"),
     [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None)),
-     (np.array([0.0, 2.5]), (0.0, 2.5)), ((np.float32(0), np.int64(2)), (0.0, 2.0)), ((-1e300, 1e300), (None, None))],
+     (np.array([0.0, 2.5]), (0.0, 2.5)), ((np.float32(0), np.int64(2)), (0.0, 2.0)), ((-1e300, 1e300), (None, None)),
+     ((0, 10**400), (0.0, None))],
 )  # fmt: skip
 def test_given_bounds_replace_the_physical_ones(bounds: Any, kept: Any):
     assert problem([Parameter("wall.value", bounds=bounds)]).unknowns["wall.value"].bounds == kept

@@ -7,9 +7,11 @@ import functools
 import inspect
 import logging
 import math
+import os
 import sys
 from collections.abc import Callable
 from numbers import Integral, Real
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -34,7 +36,7 @@ def number(
     owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False
 ) -> float:
     """Return a finite float in (above, below), or in [above, below) with `inclusive`. Raises `InputError` that names `owner` and `name`."""
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    number = real(value)
     if math.isfinite(number) and (above < number < below or (inclusive and number == above)):
         return number
     limits = [f"{'>=' if inclusive else '>'} {above:g}"] if above > -math.inf else []
@@ -42,6 +44,21 @@ def number(
     raise InputError(
         f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {shorten(repr(value), 60)}"
     )
+
+
+def real(value: Any) -> float:
+    """Return a number as a float, infinite if it is too large for one; NaN for a value that is no number."""
+    try:
+        return float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        return -math.inf if value < 0.0 else math.inf
+
+
+def path(where: str, value: Any, what: str = "a folder") -> Path:
+    """Return the path of a file or folder, else raise `InputError`. "" would be the current folder."""
+    if isinstance(value, (str, os.PathLike)) and value != "":
+        return Path(value)
+    raise InputError(f"{where}: expected {what}, got {shorten(repr(value), 60)}")
 
 
 def limits(low: float | None, high: float | None) -> list[str]:
@@ -167,4 +184,4 @@ def array_like(value: Any, advice: str) -> Any:
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"a masked array has values that do not count: {advice}")
     detach = getattr(value, "detach", None)
-    return value if detach is None else detach().cpu()
+    return value if detach is None or not hasattr(value, "cpu") else detach().cpu()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.text import did_you_mean
@@ -49,8 +49,8 @@ class Tie:
         if not self.factors:
             raise InputError("expected at least one key")
         for member, factor in self.factors.items():
-            if isinstance(factor, bool) or not isinstance(factor, Real) or not math.isfinite(factor) or factor == 0:
-                raise InputError(f"{member}: expected a finite factor other than 0, got {factor!r}")
+            if not math.isfinite(checks.real(factor)) or factor == 0:
+                raise InputError(f"{member}: expected a finite factor other than 0, got {factor!r:.60}")
 
     def info(self, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
         """Return the description of the unknown. Raise `KeyedError` if the members are incompatible."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import math
 import time
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -241,7 +240,5 @@ def check_budget(steps: int | None, seconds: float | None) -> None:
         raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
     if steps is not None:
         checks.integer("optimize", "steps", steps, at_least=1)
-    if seconds is not None and (
-        isinstance(seconds, bool) or not isinstance(seconds, Real) or not 0 < seconds < math.inf
-    ):
-        raise InputError(f"optimize: seconds must be positive and finite, got {seconds!r}")
+    if seconds is not None and not 0 < checks.real(seconds) < math.inf:
+        raise InputError(f"optimize: seconds must be positive and finite, got {seconds!r:.60}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
@@ -131,9 +130,7 @@ def _folder(
     if directory is None:
         yield []
         return
-    if directory == "" or not isinstance(directory, (str, os.PathLike)):  # "" would be the current folder
-        raise InputError(f"optimize: run_directory: expected a folder, got {directory!r:.60}")
-    run.folder = Path(directory)
+    run.folder = checks.path("optimize: run_directory", directory)
     run.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": serialization.origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(run.result())

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from unrender import gallery
+from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
@@ -61,6 +62,7 @@ def resume(
         InputError: the run folder is missing, malformed or in use; the run is finished and the budget is not larger; something has
             changed, which the message names; or no checkpoint is readable.
     """
+    directory = checks.path("resume: directory", directory)
     stored = load_run(directory, steps, seconds)
     return resume_run(stored, problem or problem_of(directory), force, callbacks, estimator, optimizer)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.runs.folder.contents import write_result
 from unrender.runs.folder.history import steps_in
 
@@ -150,8 +151,8 @@ class Result:
         """Write the run folder: run.json, history.jsonl, and the arrays. last.npz is written if `last` differs from `parameters`.
 
         Each file is written atomically, and is on disk when this returns. run.json, with `status` (None for the result's), comes last.
-        Raises `InputError` if the folder is not writable.
+        Raises `InputError` if it is no folder, or not writable.
         """
-        folder = Path(directory)
+        folder = checks.path("save: directory", directory)
         write_result(folder, self, status or self.status)
         return folder

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.text import listed, shorten
@@ -210,9 +209,9 @@ def _read(bounds: Any) -> Bounds:
     if isinstance(bounds, (str, bytes)) or not isinstance(bounds, Sequence) or len(bounds) != 2:
         raise InputError(f"expected (low, high), either may be None, got {shorten(repr(bounds), 60)}")
     for side in bounds:
-        if side is not None and (isinstance(side, bool) or not isinstance(side, Real) or math.isnan(float(side))):
+        if side is not None and math.isnan(checks.real(side)):
             raise InputError(f"expected two numbers or None, got {shorten(repr(side), 60)}")
-    low, high = (None if side is None else _single(float(side)) for side in bounds)
+    low, high = (None if side is None else _single(checks.real(side)) for side in bounds)
     if low == math.inf or high == -math.inf:
         raise InputError(f"low must be less than high, got {low} and {high}")
     low, high = None if low == -math.inf else low, None if high == math.inf else high

@@ -38,7 +38,7 @@ from typing import Any, Literal
 
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.core import tables
+from unrender.core import checks, tables
 from unrender.io import bounded_files, confinement, toml_lines
 from unrender.io.toml_lines import FieldError, Table
 from unrender.rendering.picture_format import AOVS
@@ -120,7 +120,7 @@ TABLES: dict[str, type[Table]] = {"": _Problem, "parameters": _Parameter, "views
 
 def read(path: str | Path, partial: bool = False) -> Problem:
     """Return the problem of a TOML file. Raises `InputError`, "problem.toml:12: parameters[0].bounds: ...", with the expected value."""
-    file = Path(path)
+    file = checks.path("problem", path, "a problem file")
     model, text = _read_model(file)
     try:
         with confinement.within(file.parent):

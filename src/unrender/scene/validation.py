@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from unrender.core import arrays, tables
+from unrender.core import arrays, checks, tables
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, listed, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
@@ -396,4 +396,4 @@ def check_sequence(values: Any, kind: type, name: str) -> tuple[Any, ...]:
 
 def is_number(x: Any) -> bool:
     """Return whether x is a finite real number of Python or NumPy, and no boolean."""
-    return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)
+    return isinstance(x, (int, float, np.integer, np.floating)) and math.isfinite(checks.real(x))

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.io import images, parameter_values
 from unrender.io.stored_pictures import PictureStore, StoredPicture
@@ -152,7 +152,7 @@ def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
 def _is_of_film(source: Any) -> bool:
     """Return whether the values are in the film's format, with no colour space of their own."""
     path = isinstance(source, (str, Path))
-    integers = not path and getattr(source, "dtype", None) in (np.uint8, np.uint16)
+    integers = not path and np.asarray(checks.array_like(source, "")).dtype in (np.uint8, np.uint16)
     return not integers and (not path or Path(source).suffix.lower() == ".npy")
 
 

@@ -116,8 +116,10 @@ def rigid(matrix: Any, where: str) -> tuple[np.ndarray, float]:
         array = np.asarray(matrix, float)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: expected a matrix of numbers") from error
-    if array.shape not in ((3, 4), (4, 4)) or not np.isfinite(array).all():
-        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 finite numbers, got shape {array.shape}")
+    if array.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 numbers, got shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{where}: expected a matrix of finite numbers, got {array[~np.isfinite(array)][0]}")
     if len(array) == 4:
         *rest, last = array[3]
         if not np.abs(rest).max() <= _LAST_ROW * abs(last) or not last:

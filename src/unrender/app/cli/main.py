@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import sys
 import time
@@ -27,7 +28,9 @@ from unrender.core.text import one_line
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words, is_process = list(sys.argv[1:] if arguments is None else arguments), arguments is None
+    if is_process:
+        _open_output()
     if words == ["--version"]:  # without further imports
         print(metadata.version("unrender"))
         return 0
@@ -35,7 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         memory.check()
     except VariantError as error:
         return _complain(str(error), ENVIRONMENT)
-    is_process = arguments is None
     if is_process and memory.is_limited() and (ended := memory.supervised()) is not None:
         return ended
     signals = Signals(process=is_process)
@@ -68,6 +70,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
+def _open_output() -> None:
+    """Discard what is written to closed streams, as after `>&-`, and print `?` for characters that the output's encoding lacks."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
 def _command(words: list[str], began: float) -> Callable[[], Any]:
     if words == ["doctor"]:  # works even if other modules cannot be imported
         from unrender.app.cli.doctor import doctor
@@ -75,10 +86,8 @@ def _command(words: list[str], began: float) -> Callable[[], Any]:
         return doctor
     for argument in words:
         encode_text(argument, "command line")
-        path = argument.rpartition("=")[2]
-        if path == "~" or path.startswith(
-            "~/"
-        ):  # a folder of that name would look like the home folder in every message
+        # A folder of that name would look like the home folder in every message.
+        if (path := argument.rpartition("=")[2]) == "~" or path.startswith("~/"):
             raise InputError(f"{argument}: the shell has not replaced ~ by the home folder; write $HOME{path[1:]}")
     if not _has_folder():  # Mitsuba would end the process
         raise InputError("the current folder no longer exists; change to another one")

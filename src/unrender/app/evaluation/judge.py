@@ -104,12 +104,13 @@ def judge(
     """
     variant.ensure()
     spp = checks.integer("judge", "spp", spp, at_least=1)
-    place = Path(run) / "judge" if out is None else Path(out)
+    run = checks.path("judge: run", run, "a run folder")
+    place = run / "judge" if out is None else Path(out)
     files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
     light = None if environment is None else scenes.read_light(Path(environment))
     problem, result = reopen.problem_of(run), folders.read(run)
-    held_out_file = scenes.find(Path(run), problem) if held_out is None else Path(held_out)
-    values, truth = _recovered(Path(run), problem, result)
+    held_out_file = scenes.find(run, problem) if held_out is None else Path(held_out)
+    values, truth = _recovered(run, problem, result)
     of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
     target, values, notices = _problem(problem, held_out_file, values, result)
     measured = light is None or held_out is not None

@@ -16,7 +16,7 @@ from PIL import Image
 
 from unrender.app.evaluation import scenes
 from unrender.backend import variant
-from unrender.core import phases
+from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.geometry import rotation
@@ -102,7 +102,7 @@ def turntable(
         InputError: no result, no surface, an option out of range, or `out` cannot be written. No files remain after an error.
     """
     variant.ensure()
-    place = Path(out)
+    place = checks.path("turntable: out", out, "a file")
     _check(frames, rate, size, spp, elevation, background)
     axis = None if up is None else _axis(up)
     check_video(place, overwrite, rate)

@@ -17,7 +17,7 @@ from unrender.app.exporting.formats import check as check_formats
 from unrender.app.exporting.formats import write as write_formats
 from unrender.app.exporting.graph import SceneGraph, reachable, store
 from unrender.backend import variant
-from unrender.core import arrays, periodic
+from unrender.core import arrays, checks, periodic
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
@@ -107,7 +107,7 @@ def export(
     exchange two names, the replacement takes two steps, and the next export repairs an interrupted one.
     """
     variant.ensure()
-    out, formats_ = Path(out), check_formats(formats)
+    out, formats_ = checks.path("export: out", out), check_formats(formats)
     files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
     problem, parameters, related, changed = _opened(what)
     renderer = scene_renderer(problem.renderer)
