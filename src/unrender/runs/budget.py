@@ -15,6 +15,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.path import PathGradient
 from unrender.methods import methods
+from unrender.methods.rules.constants import CONSTANTS
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.pixels import All, Uniform
 from unrender.runs.callbacks import Callback
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
-_LEAST_SPP, _FEW_PIXELS = 2, 4096  # least samples per pixel, and pixels per step, that it advises
+_LEAST_SPP = 2  # least samples per pixel that it advises
 _END_SHARE, _END_UNTESTED, _END_SECONDS = 0.1, 0.05, 1.0
 """Time reserved for verification and final images: a fraction of the budget, less without tests, plus seconds."""
 _TESTED_SHARE, _OF_TESTS = (0.6, 0.1), 1 / 9
@@ -172,21 +173,23 @@ def _warn_of_few_steps(run: Run) -> None:
         return
     expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
     needed = FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else _FEW_STEPS
-    spp, large = getattr(run.estimator, "spp", None), _suits_mini_batches(run)
-    spp, steps = spp if isinstance(spp, int) else None, max(expected, run.step)
-    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run, needed), needed, run.before)
+    spp, steps = getattr(run.estimator, "spp", None), max(expected, run.step)
+    ways = spp if isinstance(spp, int) else None, _suits_mini_batches(run), _enough(run, needed)
+    ways = (None, False, None) if run.replanned else ways  # another budget or option has other steps
+    line = few_steps(run.seconds, steps, run.steps, *ways, needed, run.before)
     run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
     run.few_steps = line
 
 
 def _suits_mini_batches(run: Run) -> bool:
-    """Return whether fewer pixels a step are an option of the method, and noise does not bias the loss: else mini-batches diverge."""
-    known = methods().get(run.description.get("method", ""))
-    sampler = run.estimator.pixels if isinstance(run.estimator, PathGradient) else None
+    """Return whether the method has an option for fewer pixels a step, whose paths are a quarter at most, and noise does not bias the loss:
+    else mini-batches diverge."""
+    estimator, known = run.estimator, methods().get(run.description.get("method", ""))
+    if not isinstance(estimator, PathGradient) or known is None or "pixels" not in known.options.model_fields:
+        return False
+    sampler = estimator.pixels
     count = sampler.count if isinstance(sampler, Uniform) else run.problem.pixels if isinstance(sampler, All) else 0
-    return (
-        count > _FEW_PIXELS and run.problem.loss.linear and known is not None and "pixels" in known.options.model_fields
-    )
+    return count * estimator.spp >= 4 * math.prod(CONSTANTS.short_batch) and run.problem.loss.linear
 
 
 def _enough(run: Run, needed: int) -> float:
@@ -214,7 +217,7 @@ def few_steps(
         seconds, steps, most: the budget, the steps that it allows, and the steps that were requested.
         spp: samples per pixel of a step, of which it advises a quarter, at least 2, since gradients without bias need two groups of
             samples; None if unknown.
-        large: whether to advise a number of pixels per step.
+        large: whether to advise a mini-batch of pixels.
         enough: seconds that the needed steps need; None if unknown.
         needed: number of steps; Gauss-Newton steps of all unknowns need fewer.
         before: seconds of the budget before the first step.
@@ -226,7 +229,7 @@ def few_steps(
         ways.append(f"fewer samples (--set spp={max(spp // 4, _LEAST_SPP)})")
     ways.append("a smaller picture (resolution)")
     if large:
-        ways.append(f"fewer pixels a step (--set pixels={_FEW_PIXELS})")
+        ways.append("fewer pixels a step (--set pixels={} --set spp={})".format(*CONSTANTS.short_batch))
     advice = ", ".join(ways[:-1]) + (", or " if len(ways) > 2 else " or ") + ways[-1]
     late = f" after {before:.0f} s of loading and compiling" if before > _LONG_BEFORE * seconds else ""
     return f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}{late}; {advice}"
