@@ -52,6 +52,13 @@ def test_cells_that_no_picture_shows_may_drift() -> None:
     assert lines(problem, changed(problem, 0.1, 2.0)) == []
 
 
+def test_a_texture_that_no_picture_shows_is_not_compared() -> None:
+    """The mean over its visible cells, of which there are none, was a warning of NumPy's."""
+    problem = made()
+    problem.renderer.matrix = 0.0 * problem.renderer.matrix  # pyright: ignore[reportAttributeAccessIssue]
+    assert lines(problem, changed(problem, 0.3, 2.0)) == []
+
+
 @pytest.mark.parametrize("lower", [0.0, 2.0])
 def test_cells_that_walk_away_are_told(lower: float) -> None:
     problem = made()

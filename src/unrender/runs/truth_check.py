@@ -161,6 +161,8 @@ def _noise(problem: Problem, key: str, of: Curvature, where: np.ndarray | None) 
 
     Few probes make single elements uncertain, so all get the standard error of their mean curvature.
     """
+    if where is not None and not where.any():
+        return 0.0
     square, noise = (float(np.mean(x[key] if where is None else x[key][where])) for x in (of.squares, of.noise))
     return _standard_error(problem, key, math.sqrt(noise) / square, where) if square > 0.0 else 0.0
 

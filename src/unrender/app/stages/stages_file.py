@@ -41,7 +41,7 @@ FILE = "stages.toml"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
 _MOST = 99
 _CONFIG = ConfigDict(extra="forbid")
-_Positive = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
+_Positive = Annotated[StrictFloat | Annotated[StrictInt, Field(lt=1 << 63)], Field(gt=0, allow_inf_nan=False)]
 _Setting = StrictStr | StrictInt | StrictFloat | bool
 _Count = Annotated[StrictInt, Field(ge=1)]
 

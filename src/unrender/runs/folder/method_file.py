@@ -17,7 +17,7 @@ from unrender.runs.run import Run
 
 _LONGEST = 1 << 20
 _Positive = Annotated[StrictInt, Field(ge=1)]
-_Seconds = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
+_Seconds = Annotated[StrictFloat | Annotated[StrictInt, Field(lt=1 << 63)], Field(gt=0, allow_inf_nan=False)]
 
 
 class Method(BaseModel):
