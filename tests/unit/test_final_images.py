@@ -505,6 +505,26 @@ def misplaced_among(references: list[np.ndarray], images: list[np.ndarray], weig
     return misplaced(made, range(len(images)), pictures, pictures)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_references_are_not_said_to_be_mirrored_by_unfinished_runs(
+    mirrored: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two lamps, left and right, whose starts are nearly each other's values: after five right steps it said so. One lamp and a mirrored
+    reference, after 40 steps."""
+    left = np.exp(-np.linspace(0.0, 3.0, 24))[None, :, None] * np.ones((24, 1, 3))
+    start, end, lamps = ([0.8], [1.0], [left]) if mirrored else ([1.0, 0.2], [0.2, 1.0], [left, left[:, ::-1]])
+    matrix, truth = np.stack([x.ravel() for x in lamps], axis=1), {"lamps": np.array(end)}
+    renderer = AnalyticRenderer(truth, matrix, 0.1, 0.05, shape=(24, 24))
+    infos = {key: replace(info, brightness="light") for key, info in renderer.parameters().items()}
+    monkeypatch.setattr(renderer, "parameters", lambda: infos)
+    reference = renderer.exact(truth)[:, :: -1 if mirrored else 1]
+    made = Problem(renderer, [Parameter("lamps", initial=np.array(start))], [View(np.ascontiguousarray(reference))])
+    given = {"steps": 40 if mirrored else 5, "run_directory": tmp_path / "run", "progress": False}
+    found = optimize(made, PathGradient(spp=2), optimizers.Adam(0.02), **given)
+    lines = [line for line in (*found.warnings, *found.undetermined) if "were mirrored left to right" in line]
+    assert bool(lines) is mirrored
+
+
 @pytest.mark.parametrize(("side", "shown"), [(3, 3), (24, 3), (192, 9), (8, 8)])
 def test_noise_of_few_pixels_looks_like_no_other_reference(side: int, shown: int) -> None:
     """A converged run of a plain wall in 3 x 3 pixels was said to look as if its reference were upside down."""

@@ -38,6 +38,7 @@ from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pi
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.reference_distortions import AS_IF, misplaced
 from unrender.runs.result import Result
+from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS
 from unrender.runs.verification import DIFFERS, SMOOTH, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
@@ -121,12 +122,10 @@ def render_final_images(
 ) -> FinalImages:
     """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
-    Of many large views, whose references are not in memory, only some are rendered. Each image is rendered in two independent halves,
-    which separate its error, weighted by the view's mask, from its noise (`statistics.debiased`).
+    Only some of many large views are rendered. Two independent halves of an image tell its error from its noise (`statistics.debiased`).
 
     Args:
-        spp: samples per pixel. None takes a power of two, at least 2, that fits into a twentieth of the time of the run's steps, or one
-            second if that is longer, and into about four million paths per image. That time excludes compiling.
+        spp: samples per pixel; None for a power of two within a twentieth of the steps' time, or a second, and 4 million paths a view.
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and the tests take half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
         weights: weights of each view's pixels in the run's steps, see `WeighsPixels`.
@@ -167,7 +166,9 @@ def render_final_images(
     errors_of = {**deviations, **maps.standard_error} if fits else {}, maps.data_share, maps.missing
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
-    texts, differs = _named([*lines, *maps.limited], differs, misplaced(problem, chosen, halves_of["initial"], ends))
+    few = result.steps < (FEW_NEWTON_STEPS if complete else FEW_STEPS)  # lights may still be far from their values
+    words = "" if few else misplaced(problem, chosen, halves_of["initial"], ends)
+    texts, differs = _named([*lines, *maps.limited], differs, words)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 
 
@@ -303,8 +304,7 @@ def _without(errors: Mapping[str, np.ndarray], keys: Sequence[str]) -> dict[str,
 def _chosen(problem: Problem) -> list[int]:
     """Return the views to render: all, or an even selection of many large ones."""
     largest = max(height * width for height, width in problem.sizes)
-    most = max(1, _MOST_BYTES // (_PICTURES * 12 * largest))
-    count = len(problem.views)
+    most, count = max(1, _MOST_BYTES // (_PICTURES * 12 * largest)), len(problem.views)
     if not problem.references.in_host_memory or count <= most:
         return list(range(count))
     return sorted({round(place) for place in np.linspace(0, count - 1, most)})
@@ -318,9 +318,7 @@ def _picture(
     if first == 0:
         return (render(problem, values, view, spp, seed),), None
     per_pass = _per_pass(problem, first)
-    one, other = (
-        render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
-    )
+    one, other = (render(problem, values, view, first, seed + x, per_pass=per_pass) for x in (0, _SECOND_HALF))
     reference = np.asarray(problem.views[view].reference)
     return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view, (one, other)))
 
