@@ -97,13 +97,26 @@ def test_a_budget_may_cover_more_than_the_steps(
     assert result.steps == steps
 
 
-@pytest.mark.parametrize(("pause", "resumed", "steps"), [(0.1, False, 2), (0.9, False, 1), (0.9, True, 2)])
-def test_a_long_step_warms_up_once(pause: float, resumed: bool, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a step of 8 s, whose kernels were known, two came before the first one of a budget of 15 s. A resumed run compares two states."""
+@pytest.mark.parametrize(
+    ("pause", "resumed", "cheaper", "steps"),
+    [
+        (0.1, False, False, 2),
+        (0.9, False, False, 1),
+        (0.9, True, False, 2),
+        (0.9, False, True, 2),
+        (1.9, False, True, 1),
+    ],
+)
+def test_a_long_step_warms_up_once(
+    pause: float, resumed: bool, cheaper: bool, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a step of 8 s, whose kernels were known, two came before the first one of a budget of 15 s. A resumed run compares two states.
+    With cheaper steps, a second one may take no more than half of what is left: 9 s of 12 had gone before the plan changed."""
     now, paused = [100.0], []
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(time, "sleep", lambda seconds: (paused.append(seconds), now.__setitem__(0, now[0] + seconds)))
-    run = loop.prepare(Plan(problem(), slow(pause), ur.optimizers.Adam(0.01)), None, 4.0, 0)
+    plan = Plan(problem(), slow(pause), ur.optimizers.Adam(0.01), cheaper=(lambda share: None) if cheaper else None)
+    run = loop.prepare(plan, None, 4.0, 0)
     run.begin_budget(now[0])
     run.resumed = [] if resumed else None
     seconds, _ = loop.warm_up(run)

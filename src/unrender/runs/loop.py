@@ -129,7 +129,8 @@ def _adopt(run: Run, plan: Plan) -> None:
 def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
     """Compile every kernel of a step by steps whose results are discarded. Return the elapsed seconds, and the snapshot after them.
 
-    It is one step if that takes much of a budget in seconds without compiling, unless a resumed run compares its state with the snapshot.
+    It is one step if that takes much of a budget in seconds without compiling, or half of what is left where the plan has cheaper steps,
+    unless a resumed run compares its state with the snapshot.
     """
     started, kernels, whole = time.perf_counter(), cache.kernels_changed(), run
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
@@ -151,9 +152,8 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         whole.trial = time.perf_counter() - began, int(estimate.info.get("samples", 0))
         trials.append(whole.trial)
         is_long = run.deadline is not None and whole.trial[0] > _LONG_STEP * (run.seconds or math.inf)
-        is_long &= (
-            run.plan.cheaper is None or whole.trial[0] > run.time_left()
-        )  # otherwise it is measured without tracing
+        # A plan with cheaper steps looks at a step without tracing, if that leaves half of the time.
+        is_long &= run.plan.cheaper is None or whole.trial[0] > 0.5 * run.time_left()
         if is_long and kernels == cache.kernels_changed() and run.resumed is None:
             break
     (first, paths), (last, own) = trials[0], trials[-1]  # the first may trace more paths
