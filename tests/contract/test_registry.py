@@ -392,7 +392,7 @@ def test_a_flag_that_is_not_true_or_false_is_refused(of: Any, flag: str) -> None
     assert of(**arguments | {flag: np.bool_(getattr(of(**arguments), flag))}) == of(**arguments)
 
 
-@pytest.mark.parametrize("kind", ["method", "gallery problem"])
+@pytest.mark.parametrize("kind", registry.KINDS)
 def test_names_are_read_from_the_source_in_their_order(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     own = {
         name: made_by
@@ -400,5 +400,5 @@ def test_names_are_read_from_the_source_in_their_order(kind: str, monkeypatch: p
         if made_by.__module__.startswith("unrender.")
     }
     monkeypatch.setattr(registry, "_components", {})
-    monkeypatch.setattr(registry, "components", lambda kind: pytest.fail(f"imports each {kind}"))
-    assert registry.names(kind) == list(own)
+    monkeypatch.setattr(registry, "components", lambda kind: {"imported": object})
+    assert registry.names(kind) == (list(own) if kind in ("method", "gallery problem") else ["imported"])

@@ -149,8 +149,9 @@ def names(kind: str) -> list[str]:
     Names of methods and gallery problems are read from the source, because the import of their modules takes a second. Other packages
     must be imported.
     """
-    package, known = _check_kind(kind).package, any(each.kind == kind for each in _components.values())
-    spec = None if known or importlib.metadata.entry_points(group=GROUP) else importlib.util.find_spec(package)
+    of, known = _check_kind(kind), any(each.kind == kind for each in _components.values())
+    imported = known or of.in_tables or importlib.metadata.entry_points(group=GROUP)
+    spec = None if imported else importlib.util.find_spec(of.package)
     folders = (spec and spec.submodule_search_locations) or ()
     texts = [path.read_text("utf-8") for folder in folders for path in Path(folder).glob("*.py")]
     found = sorted((int(position), name) for text in texts for name, position in _DECLARED.findall(text))
