@@ -441,6 +441,12 @@ def test_tensors_of_pytorch_may_require_gradients() -> None:
     assert np.array_equal(render(made, {"wall.value": value}), render(made))
 
 
+def test_a_vector_of_drjit_is_a_value_to_render() -> None:
+    """It was refused, "expected shape (3,), got (3, 1)", and taken as an initial value."""
+    made = problem([Parameter("wall.value", (0.5, 0.25, 0.125))])
+    assert np.array_equal(render(made, {"wall.value": Array3f(0.5, 0.25, 0.125)}), render(made))  # type: ignore[dict-item]
+
+
 def test_a_deep_copy_is_the_problem_itself() -> None:
     made = problem([Parameter("wall.value")])
     assert copy.deepcopy({"problem": made})["problem"] is made

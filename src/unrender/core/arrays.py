@@ -21,6 +21,12 @@ def is_drjit(x: Array) -> bool:
     return dr.is_array_v(x)
 
 
+def to_numpy(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array for values of a shape: of a vector such as `mi.Color3f`, which NumPy reads as (3, 1), (3,)."""
+    array = np.asarray(x)
+    return array[:, 0] if array.shape != shape and array.shape[1:] == (1,) and is_drjit(x) else array
+
+
 def where(mask: Array, a: Array, b: Array) -> Array:
     """Return `a` where `mask` is true and `b` elsewhere; `a` and `b` may be numbers."""
     return dr.select(mask, a, b) if is_drjit(mask) else np.where(mask, a, b)

@@ -91,7 +91,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         return periodic.repeat(conversion.stored(values), conversion.repeated), notice
     initial = checks.array_like(initial, "fill it")
     try:
-        array = np.asarray(initial)
+        array = arrays.to_numpy(initial, shape)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
             raise TypeError
         with np.errstate(over="ignore"):
@@ -104,8 +104,6 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         raise InputError("must be finite, got NaN or infinite values")
     if array.size > 3 and not conversion.takes_number and not np.ptp(array):
         raise InputError(f"expected different values, got {array.flat[0]:g} for all")
-    if array.shape != shape and array.shape[1:] == (1,) and arrays.is_drjit(initial):  # a vector such as mi.Color3f
-        array = array[:, 0]
     if array.shape == shape:
         return periodic.repeat(array, conversion.repeated), ""
     if array.shape == conversion.picture_shape(shape):

@@ -121,8 +121,8 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
         raise InputError(f"parameters: expected values by key of the problem's unknowns, got {parameters!r:.60}")
     if set(parameters) != set(point):
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
-    given = {key: np.asarray(checks.array_like(value, "fill it")) for key, value in parameters.items()}
-    parameters = problem.full(given)
+    given = {key: checks.array_like(value, "fill it") for key, value in parameters.items()}
+    parameters = problem.full({key: arrays.to_numpy(x, arrays.shape(point[key])) for key, x in given.items()})
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
