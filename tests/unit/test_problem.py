@@ -19,6 +19,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.references import View
 from unrender.scene.render import render
 
+MASKED: Any = np.ma.masked_greater([0.0, 1.0], 0.5)
 HEIGHT, WIDTH = 4, 5
 PIXELS = HEIGHT * WIDTH * 3
 
@@ -334,6 +335,11 @@ BAD_PARAMETERS: list[tuple[Parameter, str]] = [
         r"bounds: no range of values is within \[-5, 0\] and its range \[0, ",
     ),
     (Parameter("wall.value", bounds=(np.inf, None)), "bounds: low must be less than high"),
+    (Parameter("wall.value", bounds=(1e39, None)), r"with numbers up to 3.4e\+38 between, got 1e\+39 and None"),
+    (
+        Parameter("wall.value", bounds=MASKED),
+        "bounds: a masked array has values that do",
+    ),
     (Parameter("wall.value", bounds=(0.0, float("nan"))), "bounds: expected two numbers or None, got nan"),
     (Parameter("wall.value", bounds=(0.0,)), "bounds: expected"),  # pyright: ignore
     (Parameter("wall.value", bounds="01"), "bounds: expected"),  # pyright: ignore

@@ -205,7 +205,8 @@ def _off_ends(x: Array, low: float | None, high: float | None) -> Array:
 
 
 def _read(bounds: Any) -> Bounds:
-    bounds = bounds.tolist() if hasattr(bounds, "tolist") else bounds  # an array
+    bounds = checks.array_like(bounds, "give (low, high), either may be None")
+    bounds = bounds.tolist() if hasattr(bounds, "tolist") else bounds
     if isinstance(bounds, (str, bytes)) or not isinstance(bounds, Sequence) or len(bounds) != 2:
         raise InputError(f"expected (low, high), either may be None, got {shorten(repr(bounds), 60)}")
     for side in bounds:
@@ -213,7 +214,8 @@ def _read(bounds: Any) -> Bounds:
             raise InputError(f"expected two numbers or None, got {shorten(repr(side), 60)}")
     low, high = (None if side is None else _single(checks.real(side)) for side in bounds)
     if low == math.inf or high == -math.inf:
-        raise InputError(f"low must be less than high, got {low} and {high}")
+        given = " and ".join(shorten(str(side), 60) for side in bounds)
+        raise InputError(f"low must be less than high, with numbers up to {_LARGEST:.3g} between, got {given}")
     low, high = None if low == -math.inf else low, None if high == math.inf else high
     if low is not None and high is not None and low >= high:
         raise InputError(f"low must be less than high, got {low:g} and {high:g}")
