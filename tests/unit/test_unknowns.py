@@ -26,8 +26,8 @@ DETAIL = {**LATE, "correlation": 1 / 128}
 def test_a_hull_has_its_normals_and_then_all_detail_by_shorter_steps() -> None:
     materials = ["colour", "roughness", "metallic", "light"]
     assert _stages(*unknowns.OF_HULL) == [
-        ("coarse-materials", materials, None),
-        ("materials", materials, None),
+        ("coarse-materials", materials, {}),
+        ("materials", materials, {}),
         ("normals", list(unknowns.OF_HULL), LATE),
         ("detail", list(unknowns.OF_HULL), DETAIL),
     ]
@@ -37,7 +37,7 @@ def test_a_hull_has_its_normals_and_then_all_detail_by_shorter_steps() -> None:
 
 
 def test_without_normals_detail_alone_has_settings_of_its_own() -> None:
-    assert [settings for *_, settings in _stages(*unknowns.DEFAULT)] == [None, None, DETAIL]
+    assert [settings for *_, settings in _stages(*unknowns.DEFAULT)] == [{}, {}, DETAIL]
 
 
 def test_a_shape_keeps_the_short_steps_of_the_stages_before_it() -> None:
