@@ -437,6 +437,22 @@ def test_noise_of_the_test_leaves_no_number_open_of_which_the_run_knows_the_erro
     assert seen[0].tolist() == [True, False, False, False]
 
 
+def test_a_small_step_beyond_its_error_asks_for_more_steps_before_a_wrong_scene_is_blamed():
+    """A projector 0.006 rad away, seven standard errors but a small part of its range, left 1.2 % of the picture to a curved change."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    of = 0.1 * MATRIX.T.reshape(4, -1, 3)
+    noise = np.random.default_rng(1).normal(0.0, 1e-4, (2, *of.shape[1:]))
+    fit = _Fit.of(numbers, Differences(0.1 * np.eye(4), of, of), noise)
+    for errors in (0.0, 6.0):
+        step = errors * np.maximum(np.hypot(fit.error, fit.own), 1e-9)
+        found = _checked(numbers, dataclasses.replace(fit, step=step, unexplained=0.012), np.full(4, 0.01))
+        assert not found.unfinished  # too small to be told
+        assert "1.2 %" in found.distorted
+        assert ("give more steps" in found.distorted) is bool(errors)
+
+
 SIDE = 24
 
 

@@ -351,7 +351,8 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     known = np.where((error > sizes) | refuted | (fit.beyond != 0.0), np.inf, error)
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
-    if line := _distorted(numbers, fit, of_step, bool((further | refuted).any())):
+    moves = np.abs(fit.step) > _STEP_ERRORS * of_step  # what is left of a step's pictures may be its curvature
+    if line := _distorted(numbers, fit, of_step, bool((moves | refuted).any())):
         sure = refuted | unseen.any(axis=1) | (fit.own > sizes)  # its residual leaves other numbers open
         undetermined = {key: text for key, text in undetermined.items() if sure[numbers.places()[key]].any()}
         return NumbersCheck(undetermined, unfinished, {}, steps, noise, numbers.keys, distorted=line)
