@@ -115,3 +115,15 @@ def test_a_bad_problem_or_name_is_told_before_what_takes_long_to_import(tmp_path
 def test_the_budget_of_a_command_begins_with_its_process() -> None:
     """On a loaded machine, 2 to 4 s of imports came before it."""
     assert imported(BEGAN) == {"True"}
+
+
+def test_a_command_has_one_thread_of_blas_unless_told() -> None:
+    """Beside busy processes, small least-squares systems took a hundred times as long with two, which wait for one another."""
+    show = "(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"  # NumPy reads it when it is imported
+    script = f"import os, sys; from unrender.app.cli import main as m; m._command = lambda *_: lambda: print({show}); m.main()"
+    for given, expected in ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({}, "1"):
+        environment = {k: x for k, x in os.environ.items() if k != "OPENBLAS_NUM_THREADS"} | given
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split("\n")[0] == f"('{expected}', False)"
