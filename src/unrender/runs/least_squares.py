@@ -351,23 +351,24 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     known = np.where((error > sizes) | refuted | (fit.beyond != 0.0), np.inf, error)
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
-    moves = np.abs(fit.step) > _STEP_ERRORS * of_step  # what is left of a step's pictures may be its curvature
-    if line := _distorted(numbers, fit, of_step, bool((moves | refuted).any())):
+    if line := _distorted(numbers, fit, of_step, bool(refuted.any())):
         sure = refuted | unseen.any(axis=1) | (fit.own > sizes)  # its residual leaves other numbers open
         undetermined = {key: text for key, text in undetermined.items() if sure[numbers.places()[key]].any()}
         return NumbersCheck(undetermined, unfinished, {}, steps, noise, numbers.keys, distorted=line)
     return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
 
 
-def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, unsettled: bool) -> str:
+def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, refuted: bool) -> str:
     """Return a line about a distortion of a reference that would move numbers by several standard errors (n,), or about a difference that
-    no numbers explain; "" for none. Where numbers are `unsettled`, their pictures may differ as if so."""
+    no numbers explain; "" for none. Where numbers have not settled, or are `refuted`, their pictures may differ as if so."""
     moves = np.broadcast_to(fit.moves, of_step.shape)
     far = {
         key: moves[of] for key, of in numbers.places().items() if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
     }
     moved = [f"{key} by {_numbers(by)}" for key, by in far.items()]
     line = f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references "
+    # What a step leaves of the pictures may be its curvature, however small a part of the number's range it is.
+    unsettled = refuted or bool((np.abs(fit.step) > _STEP_ERRORS * of_step).any())
     first = "give more steps or another start, then " * unsettled
     if moved:
         return f"{line}{fit.distortion}, which would move {listed(moved)}; {first}check the references and the camera"
