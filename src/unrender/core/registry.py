@@ -154,8 +154,9 @@ def names(kind: str) -> list[str]:
     spec = None if imported else importlib.util.find_spec(of.package)
     folders = (spec and spec.submodule_search_locations) or ()
     texts = [path.read_text("utf-8") for folder in folders for path in Path(folder).glob("*.py")]
-    found = sorted((int(position), name) for text in texts for name, position in _DECLARED.findall(text))
-    return [name for _, name in found] or list(components(kind))
+    declared = [match for text in texts for match in _DECLARED.findall(text)]
+    in_order = sorted((int(position), name) for name, position in declared)
+    return [name for _, name in in_order] or list(components(kind))
 
 
 def components(kind: str) -> dict[str, type]:

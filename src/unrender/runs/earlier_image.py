@@ -160,8 +160,8 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
 
 def of_best(difference: Misfit, pictures: FreshPictures, best: Picture) -> Misfit | None:
     """Return a difference of the end with the size of that of better parameters, which the result holds; None if these have none."""
-    found = misfit(pictures.compare(best.images), _OF_PICTURE)
-    return found and replace(found, explanation=difference.explanation, causes=difference.causes)
+    smaller = misfit(pictures.compare(best.images), _OF_PICTURE)
+    return smaller and replace(smaller, explanation=difference.explanation, causes=difference.causes)
 
 
 def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> Misfit | None:

@@ -33,7 +33,7 @@ _ORIENTATIONS = {
     "mirrored along a diagonal": lambda x: x.swapaxes(0, 1),
     "mirrored along the other diagonal": lambda x: x[::-1, ::-1].swapaxes(0, 1),
 }
-"""What may have been done to a reference, and the function of an image that undoes it."""
+"""Errors of orientation of a reference, and for each the function that corrects its image."""
 _BETTER, _CLEARLY, _MOST_VIEWS, _SIDE = 0.5, 0.1, 32, 64
 """Share of the contrast that another reference may leave, relative to that which the view's own one leaves, and least difference of both
 shares; most views whose references are compared with each other; most pixels of a side of the compared images."""
@@ -125,15 +125,15 @@ def misplaced(
 
     The pictures (H, W, 3) of the start tell, since unknowns may have fitted wrong references; those of the end must still differ.
     """
-    known, found = problem.renderer.parameters(), dict[str, list[int]]()
+    known = problem.renderer.parameters()
     if not all(known[key].brightness or known[key].scattering for key in problem.unknowns):
         return ""
     references = [np.asarray(problem.views[view].reference) for view in views]
+    found: dict[str, list[int]] = {}
     for view, start, end, own in zip(views, starts, ends, references, strict=True):
         weights = problem.test_weights(view, end)
-        if (
-            np.count_nonzero(_thinned(weights)) < _LEAST_SIDE**2
-        ):  # noise of so few pixels resembles another one by chance
+        # Noise of fewer pixels resembles another orientation by chance.
+        if np.count_nonzero(_thinned(weights)) < _LEAST_SIDE**2:
             continue
         others = {f"were {words}": undo(own) for words, undo in _ORIENTATIONS.items()}
         if len(views) <= _MOST_VIEWS:

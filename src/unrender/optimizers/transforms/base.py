@@ -110,7 +110,7 @@ class StepTransform(ABC):
     requires: ClassVar[tuple[type[Capability], ...]] = ()
     """Capabilities that the estimate must have in addition to the gradient."""
     sets_steps: ClassVar[bool] = False
-    """Whether `update` sets `StepUpdate.steps`, which later transforms cannot change."""
+    """Whether `update` sets `StepUpdate.steps`. Later transforms cannot change these."""
 
     @abstractmethod
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Any:
