@@ -445,7 +445,7 @@ def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
     assert ur.resume(tmp_path, made, steps=4).parameters["strength"] == pytest.approx(whole.parameters["strength"])
 
 
-@pytest.mark.usefixtures("short_ends")
+@pytest.mark.usefixtures("short_ends", "one_thread")
 def test_a_run_with_functions_of_python_is_resumed_bit_for_bit_or_refused(tmp_path: Path) -> None:
     """Another function of the same name was taken for the one of the run, and the descent went on with it."""
 
