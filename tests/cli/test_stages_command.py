@@ -285,7 +285,9 @@ def test_a_run_that_was_killed_before_its_first_record_goes_on_with_its_options(
     assert seen[1].stages.steps == 16
     file = staged / "result" / "stages.toml"
     file.write_text(file.read_text().replace("threads = 1", "threads = 0"))
-    assert "run.threads: expected a whole number of at least 1, got 0" in unrender("resume", "result").error
+    assert (
+        "run.threads: expected a whole number of at least 1, below 2**32, got 0" in unrender("resume", "result").error
+    )
 
 
 @pytest.mark.parametrize(

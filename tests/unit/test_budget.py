@@ -324,12 +324,12 @@ def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatc
         (0, None, "steps must be a whole number of at least 1, got 0"),
         (2.0, None, "steps must be a whole number of at least 1, got 2.0"),
         (True, None, "steps must be a whole number of at least 1, got True"),
-        (1 << 63, None, "steps must be below"),
+        (1 << 63, None, "steps must be at most 9223372036854775807, got 9223372036854775808"),
         (None, 0, "seconds must be positive and finite, got 0"),
         (None, math.inf, "seconds must be positive and finite, got inf"),
         (None, math.nan, "seconds must be positive and finite, got nan"),
         (None, True, "seconds must be positive and finite, got True"),
-        (None, 10**400, "seconds must be positive and finite, got 1000"),
+        (None, 10**400, "seconds must be positive and finite, got an integer of 1329 bits"),
         (None, "5", "seconds must be positive and finite, got '5'"),
     ],
 )
@@ -376,9 +376,18 @@ def test_numbers_of_numpy_are_a_budget() -> None:
     numbers: Any = {"view": np.int64(0), "spp": np.int64(2), "seed": np.int64(1)}
     assert np.array_equal(ur.render(problem(), **numbers), ur.render(problem(), spp=2, seed=1))
     wrong: Any
-    for name, wrong in (("view", 0.0), ("view", None), ("seed", 1.5)):
+    for name, wrong in (("view", 0.0), ("view", None), ("seed", 1.5), ("spp", 10**400), ("spp", 2**32)):
         with pytest.raises(ur.InputError, match=f"^render: {name}"):
             ur.render(problem(), **{name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_not_rendered(wrong: float) -> None:
+    values = {key: np.full(np.shape(x), wrong) for key, x in problem().initial().items()}
+    renderings = [lambda: ur.render(problem(), values), lambda: ur.estimate(problem(), "plain", values)]
+    for render in [*renderings, lambda: ur.render_pair(problem(), problem().initial(), values, 2, 0)]:
+        with pytest.raises(ur.InputError, match=r"^parameter .*: expected finite values, got NaN or infinite ones$"):
+            render()
 
 
 def test_slowdown_is_at_least_one() -> None:

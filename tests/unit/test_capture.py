@@ -369,6 +369,31 @@ def test_broken_exif_is_passed_over(tmp_path: Path) -> None:
         assert pictures.upright(tmp_path / "a.jpg", None) == (8, 6, 1)
 
 
+@pytest.mark.parametrize(
+    ("orientation", "lens", "expected"),
+    [
+        (6, (8, 6), (8, 6, 1)),
+        (6, (6, 8), (6, 8, 6)),
+        (3, (8, 6), None),  # turned by 180°, it has the same size
+        (6, (8, 8), None),
+        (6, None, None),
+        (9, None, (8, 6, 1)),  # none of EXIF's
+    ],
+)
+def test_exif_that_the_size_of_the_camera_does_not_decide_is_refused(
+    orientation: int, lens: tuple[int, int] | None, expected: tuple[int, int, int] | None, tmp_path: Path
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new("RGB", lens if lens == (8, 8) else (8, 6)).save(tmp_path / "a.jpg", exif=exif)
+    camera = lens and Lens(*lens, 8.0, 8.0, 4.0, 4.0)
+    if expected:
+        assert pictures.upright(tmp_path / "a.jpg", camera) == expected
+        return
+    with pytest.raises(InputError, match=rf"its EXIF orientation is {orientation}, and nothing tells"):
+        pictures.upright(tmp_path / "a.jpg", camera)
+
+
 def test_only_errors_of_pillow_are_errors_of_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def raising(picture: Image.Image) -> int:
         raise TypeError("a fault of the program")

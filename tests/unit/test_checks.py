@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from unrender.core import checks, registry
-from unrender.core.checks import Count, Fraction, Index, NotNegative, OpenFraction, Positive, Several
+from unrender.core.checks import Count, Fraction, Index, NotNegative, OpenFraction, Positive, Seed, Several
 from unrender.core.errors import InputError
 
-RANGES = ("Positive", "NotNegative", "Fraction", "OpenFraction", "Index", "Count", "Several", "bool", "Literal")
+RANGES = ("Positive", "NotNegative", "Fraction", "OpenFraction", "Index", "Seed", "Count", "Several", "bool", "Literal")
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,8 @@ class Options(checks.Checked):
     pull: NotNegative = 0.0
     decay: Fraction = 0.0
     damping: OpenFraction = 0.5
-    seed: Index = 0
+    seed: Seed = 0
+    start: Index = 0
     count: Count = 1
     pair: Several | None = None
     flag: bool = False
@@ -30,7 +31,7 @@ class Options(checks.Checked):
 
 
 def test_values_within_the_ranges_are_taken() -> None:
-    Options(1e-9, 2.0, 0.999, 1e-9, 7, 3, 2, True, "c", "anything")
+    Options(1e-9, 2.0, 0.999, 1e-9, 2**63 - 1, 7, 2**32 - 1, 2, True, "c", "anything")
     Options(kind=None, pair=None)
 
 
@@ -50,6 +51,13 @@ def test_numbers_of_numpy_become_pythons() -> None:
         ("decay", 1.0, "decay must be a finite number >= 0 and < 1, got 1.0"),
         ("damping", 0.0, "damping must be a finite number > 0 and < 1, got 0.0"),
         ("seed", -1, "seed must be a whole number of at least 0, got -1"),
+        ("seed", 2**63, "seed must be at most 9223372036854775807, got 9223372036854775808"),
+        ("start", 2**32, "start must be at most 4294967295, got 4294967296"),
+        ("count", 10**400, "count must be at most 4294967295, got an integer of 1329 bits"),
+        pytest.param(
+            "count", -(10**5000), "count must be a whole number of at least 1, got an integer of 16610 bits", id="minus"
+        ),
+        pytest.param("rate", 10**5000, "rate must be a finite number > 0, got an integer of 16610 bits", id="long"),
         ("count", None, "count must be a whole number of at least 1, got None"),
         ("count", [0] * 99, f"count must be a whole number of at least 1, got [{'0, ' * 11}0 ... {'0, ' * 5}0, 0]"),
         ("pair", 1, "pair must be a whole number of at least 2, got 1"),

@@ -16,8 +16,10 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, printable, shorten
+from unrender.core.text import did_you_mean, in_words, printable
 
+LARGEST = (1 << 63) - 1
+"""Largest whole number that the files of a run hold."""
 Positive = Annotated[float, 0.0]
 """Annotation of a field: a finite number > 0."""
 NotNegative = Annotated[float, 0.0, math.inf, True]
@@ -29,7 +31,8 @@ OpenFraction = Annotated[float, 0.0, 1.0]
 Index = Annotated[int, 0]
 Count = Annotated[int, 1]
 Several = Annotated[int, 2]
-"""Whole numbers of at least 0, 1 and 2."""
+"""Whole numbers of at least 0, 1 and 2, below 2³²."""
+Seed = Annotated[int, 0, LARGEST]
 
 
 def number(
@@ -42,7 +45,7 @@ def number(
     limits = [f"{'>=' if inclusive else '>'} {above:g}"] if above > -math.inf else []
     limits += [f"< {below:g}"] if below < math.inf else []
     raise InputError(
-        f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {shorten(repr(value), 60)}"
+        f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {in_words(value)}"
     )
 
 
@@ -58,7 +61,7 @@ def path(where: str, value: Any, what: str = "a folder") -> Path:
     """Return the path of a file or folder, else raise `InputError`. "" would be the current folder."""
     if isinstance(value, (str, os.PathLike)) and value != "":
         return Path(value)
-    raise InputError(f"{where}: expected {what}, got {shorten(repr(value), 60)}")
+    raise InputError(f"{where}: expected {what}, got {in_words(value)}")
 
 
 def limits(low: float | None, high: float | None) -> list[str]:
@@ -66,11 +69,13 @@ def limits(low: float | None, high: float | None) -> list[str]:
     return [f"{word} {end:g}" for word, end in (("at least", low), ("at most", high)) if end is not None]
 
 
-def integer(owner: str, name: str, value: Any, at_least: int) -> int:
-    """Return `value` as an integer >= `at_least`, else raise `InputError`."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
+def integer(owner: str, name: str, value: Any, at_least: int, at_most: int = (1 << 32) - 1) -> int:
+    """Return `value` as an integer in [`at_least`, `at_most`], else raise `InputError`. Dr.Jit counts below 2³²."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if whole and at_least <= int(value) <= at_most:
         return int(value)
-    raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {shorten(repr(value), 60)}")
+    limit = f"at most {at_most}" if whole and int(value) > at_most else f"a whole number of at least {at_least}"
+    raise InputError(f"{owner}: {name} must be {limit}, got {in_words(value)}")
 
 
 def flag(owner: str, name: str, value: Any) -> None:

@@ -7,7 +7,7 @@ from numbers import Integral
 from typing import Any
 
 from unrender.core.errors import InputError
-from unrender.core.text import printable
+from unrender.core.text import in_words
 
 _MASK = 0xFFFFFFFFFFFFFFFF
 
@@ -29,8 +29,7 @@ def check_seed(owner: str, seed: Any, runs: int = 1) -> int:
     is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
     if is_integer and LEAST_SEED <= (value := int(seed)) <= LARGEST_SEED - (runs - 1):
         return value
-    got = f"an integer of {int(seed).bit_length()} bits" if is_integer else printable(seed)
-    raise InputError(f"{owner}: expected a whole number from -2**63 to 2**63 - {max(runs, 1)}, got {got}")
+    raise InputError(f"{owner}: expected a whole number from -2**63 to 2**63 - {max(runs, 1)}, got {in_words(seed)}")
 
 
 WARM_UP = 1

@@ -32,6 +32,13 @@ def shorten(text: str, longest: int) -> str:
     return f"{text[: longest - tail - 5]} ... {text[-tail:]}"
 
 
+def in_words(value: Any) -> str:
+    """Format a value for a message in at most 60 characters; an integer of more than 128 bits by their number."""
+    if isinstance(value, int) and value.bit_length() > 128:  # Python prints no integer of more than 4300 digits
+        return f"an integer of {value.bit_length()} bits"
+    return shorten(repr(value), 60)
+
+
 def listed(names: Sequence[str]) -> str:
     """Join names as "a, b". A list of more than eight names is cut after four, with the number of the others."""
     if len(names) <= 2 * _NAMED:

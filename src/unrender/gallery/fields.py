@@ -35,10 +35,7 @@ def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 
     """Return a dataclass field of an `Option`: an integer in [at_least, at_most], described by `about`."""
 
     def check(owner: str, name: str, value: Any) -> int:
-        number = checks.integer(owner, name, value, at_least)
-        if number > at_most:
-            raise InputError(f"{owner}: {name} must be at most {at_most}, got {number}")
-        return number
+        return checks.integer(owner, name, value, at_least, at_most)
 
     return field(default=default, metadata={"kind": int, "about": about, "check": check})
 

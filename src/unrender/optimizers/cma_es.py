@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from unrender.core import checks, trees
-from unrender.core.checks import Index, Positive
+from unrender.core.checks import Positive, Seed
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -81,7 +81,7 @@ class CMAES:
 
     sigma0: Positive = 0.3
     population: int | None = None
-    seed: Index = 0
+    seed: Seed = 0
     diagonal: bool = False
     learning_rate: float | Mapping[str, float] = 1.0
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import checks
-from unrender.core.checks import Count, Index
+from unrender.core.checks import Count, Seed
 from unrender.core.errors import InputError
 from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
@@ -46,7 +46,7 @@ class Options:
     sensors: tuple[int, ...]
     single: bool
     max_depth: int
-    seed: Index
+    seed: Seed
     references: tuple[Any, ...] = field(default=(), compare=False)
     loss: Any = field(default=None, compare=False)
 

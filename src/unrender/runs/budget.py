@@ -12,6 +12,7 @@ import numpy as np
 from unrender.backend import cache
 from unrender.core import checks, timing
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.estimators.base import Estimate
 from unrender.estimators.path import PathGradient
 from unrender.methods import methods
@@ -49,7 +50,6 @@ _END_OF_STEPS, LEAST_END, LEAST_NUMBERS = 1 / 3, 1.5, 0.5
 of 80 steps of a wall of 400 texels had no standard errors; and the minimum for the check of few numbers."""
 _OF_STEP = 2  # cost of a path of a step, and launches of a step, relative to a rendering: most steps have an adjoint
 _LONG_SHARE = 0.2  # share of the time for steps that one of them may take
-_MOST_STEPS = 1 << 63  # exclusive limit that the files of a run folder can store
 
 
 class Budget(Callback):
@@ -239,9 +239,7 @@ def check_budget(steps: int | None, seconds: float | None) -> None:
     """Raise `InputError` unless a limit is given, `steps` is a whole number in [1, 2⁶³), and `seconds` is positive and finite."""
     if steps is None and seconds is None:
         raise InputError("optimize: set a budget, steps= or seconds=")
-    if isinstance(steps, int) and steps >= _MOST_STEPS:
-        raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
     if steps is not None:
-        checks.integer("optimize", "steps", steps, at_least=1)
+        checks.integer("optimize", "steps", steps, at_least=1, at_most=checks.LARGEST)
     if seconds is not None and not 0 < checks.real(seconds) < math.inf:
-        raise InputError(f"optimize: seconds must be positive and finite, got {seconds!r:.60}")
+        raise InputError(f"optimize: seconds must be positive and finite, got {in_words(seconds)}")

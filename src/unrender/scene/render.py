@@ -43,7 +43,7 @@ def render(
         float32 (H, W, 3), linear RGB.
 
     Raises:
-        InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes.
+        InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes, or are not finite.
     """
     spp = checks.integer("render", "spp", spp, at_least=1)
     seed, view = check_seed("render: seed", seed), checks.integer("render", "view", view, at_least=0)
@@ -113,7 +113,7 @@ def render_pair(
 
 
 def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:
-    """Return `parameters` as arrays of the renderer; None for the initial ones. Raises `InputError` if keys or shapes differ."""
+    """Return `parameters` as arrays of the renderer; None for the initial ones. Raises `InputError` for other keys or shapes, and NaN."""
     point = problem.initial()
     if parameters is None:
         return point
@@ -126,6 +126,8 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
+        if not np.isfinite(value).all():
+            raise InputError(f"parameter {key}: expected finite values, got NaN or infinite ones")
     return {key: problem.renderer.array(np.asarray(parameters[key])) for key in point}
 
 

@@ -74,7 +74,7 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
         hold_out: interval of lights that are held out, >= 2; 0 for none; None for 6. None are held out if fewer than four would remain.
 
     Raises:
-        InputError: a photograph cannot be read, has another size, or the mask is empty.
+        InputError: a photograph cannot be read, is turned by EXIF, has another size, or the mask is empty.
     """
     every = 6 if hold_out is None else hold_out
     if every == 1 or every < 0:
@@ -85,6 +85,7 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
     resample = Resampling(lens, target)
     resampled = []
     for path in capture.photographs:
+        pictures.upright(path, None)
         read = pictures.read(path).values
         if read.shape[:2] != (height, width):
             has = f"{read.shape[1]} x {read.shape[0]} pixels, the first photograph {width} x {height}"

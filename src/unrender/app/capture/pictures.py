@@ -108,16 +108,23 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
 
 
 def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
-    """Return width, height and orientation with which a photograph has the lens's aspect ratio. Raises `InputError` if there are none.
+    """Return width, height and orientation with which a photograph has the lens's aspect ratio.
 
-    Cameras are calibrated on pixels, and most programs use them as stored. EXIF's orientation is therefore applied only if the rotated
-    picture has the lens's aspect ratio and the stored one does not.
+    Some programs calibrate cameras on pixels as they are stored, others on those that EXIF's orientation turns. Raises `InputError` if
+    neither has the lens's aspect ratio, or both.
     """
     width, height, orientation = _stored_size(path)
-    if lens is None or _proportional(width, height, lens):
+    stored = lens is None or _proportional(width, height, lens)
+    sides = (height, width) if orientation in _QUARTER_TURNS else (width, height)
+    if 2 <= orientation <= 8 and (lens is None or _proportional(*sides, lens)):
+        if not stored:
+            return *sides, orientation
+        raise InputError(
+            f"{path}: its EXIF orientation is {orientation}, and nothing tells whether its camera is that of the turned pixels; save the "
+            "pixels as the camera shows them, without it"
+        )
+    if stored:
         return width, height, 1
-    if orientation in _QUARTER_TURNS and width != height and _proportional(height, width, lens):
-        return height, width, orientation
     raise InputError(
         f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: expected the same aspect ratio"
     )

@@ -138,8 +138,7 @@ def _check(frames: int, rate: float, size: int, spp: int, elevation: float, back
         raise InputError(f"--rate {rate:g}: expected above 0 and at most 240")
     if not isinstance(size, int) or size % 2 or not 8 <= size <= _LARGEST:
         raise InputError(f"--size {size}: expected an even number from 8 to {_LARGEST}")
-    if not isinstance(spp, int) or spp < 1:
-        raise InputError(f"--spp {spp}: expected at least 1")
+    checks.integer("turntable", "spp", spp, at_least=1)
     if not -90 < elevation < 90:
         raise InputError(f"--elevation {elevation:g}: expected above -90 and below 90 degrees")
     if background not in BACKGROUNDS:

@@ -43,7 +43,7 @@ _MOST = 99
 _CONFIG = ConfigDict(extra="forbid")
 _Positive = Annotated[StrictFloat | Annotated[StrictInt, Field(lt=1 << 63)], Field(gt=0, allow_inf_nan=False)]
 _Setting = StrictStr | StrictInt | StrictFloat | bool
-_Count = Annotated[StrictInt, Field(ge=1)]
+_Count, _COUNT = Annotated[StrictInt, Field(ge=1, lt=1 << 32)], "a whole number of at least 1, below 2**32"
 
 
 @dataclass(frozen=True, config=_CONFIG)
@@ -67,9 +67,9 @@ class RunOptions:
     """Options of a run in stages that do not affect its results, see `optimize` and `RunAnnotations`."""
 
     variant: StrictStr = Field(default="auto", description="a variant of Mitsuba")
-    threads: _Count | None = Field(default=None, description="a whole number of at least 1")
-    checkpoint_every: _Count | None = Field(default=None, description="a whole number of at least 1")
-    final_spp: _Count | None = Field(default=None, description="a whole number of at least 1")
+    threads: _Count | None = Field(default=None, description=_COUNT)
+    checkpoint_every: _Count | None = Field(default=None, description=_COUNT)
+    final_spp: _Count | None = Field(default=None, description=_COUNT)
 
 
 @dataclass(frozen=True, config=_CONFIG)
@@ -85,7 +85,7 @@ class Stages:
     settings: dict[StrictStr, _Setting] = Field(
         default={}, description="a table of the method's options, such as { spp = 4 }"
     )
-    steps: _Count | None = Field(default=None, description="a whole number of at least 1")
+    steps: Annotated[StrictInt, Field(ge=1)] | None = Field(default=None, description="a whole number of at least 1")
     seconds: _Positive | None = Field(default=None, description="a number above 0")
     seed: Annotated[StrictInt, Field(ge=0)] = Field(default=0, description="a whole number of at least 0")
     run: RunOptions | None = Field(default=None, description="a table of a run's options")
