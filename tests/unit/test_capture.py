@@ -385,7 +385,7 @@ def test_exif_that_the_size_of_the_camera_does_not_decide_is_refused(
 ) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.new("RGB", lens if lens == (8, 8) else (8, 6)).save(tmp_path / "a.jpg", exif=exif)
+    Image.new("RGB", (8, 8) if lens == (8, 8) else (8, 6)).save(tmp_path / "a.jpg", exif=exif)
     camera = lens and Lens(*lens, 8.0, 8.0, 4.0, 4.0)
     if expected:
         assert pictures.upright(tmp_path / "a.jpg", camera) == expected

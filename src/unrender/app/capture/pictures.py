@@ -114,16 +114,16 @@ def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
     neither has the lens's aspect ratio, or both.
     """
     width, height, orientation = _stored_size(path)
-    stored = lens is None or _proportional(width, height, lens)
     sides = (height, width) if orientation in _QUARTER_TURNS else (width, height)
-    if 2 <= orientation <= 8 and (lens is None or _proportional(*sides, lens)):
+    stored, turned = (lens is None or _proportional(*of, lens) for of in ((width, height), sides))
+    if 2 <= orientation <= 8 and turned:
         if not stored:
             return *sides, orientation
         raise InputError(
             f"{path}: its EXIF orientation is {orientation}, and nothing tells whether its camera is that of the turned pixels; save the "
             "pixels as the camera shows them, without it"
         )
-    if stored:
+    if stored or lens is None:
         return width, height, 1
     raise InputError(
         f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: expected the same aspect ratio"

@@ -43,7 +43,8 @@ _MOST = 99
 _CONFIG = ConfigDict(extra="forbid")
 _Positive = Annotated[StrictFloat | Annotated[StrictInt, Field(lt=1 << 63)], Field(gt=0, allow_inf_nan=False)]
 _Setting = StrictStr | StrictInt | StrictFloat | bool
-_Count, _COUNT = Annotated[StrictInt, Field(ge=1, lt=1 << 32)], "a whole number of at least 1, below 2**32"
+_Count = Annotated[StrictInt, Field(ge=1, lt=1 << 32)]
+_COUNT = "a whole number of at least 1, below 2**32"
 
 
 @dataclass(frozen=True, config=_CONFIG)
