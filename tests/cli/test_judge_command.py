@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unrender.io import images
+
 KEY = "wall.bsdf.reflectance.value"
 FOUND = np.array([0.5, 0.4, 0.3], np.float32)
 TRUTH = np.array([0.6, 0.5, 0.4], np.float32)
@@ -149,7 +151,7 @@ def test_formats_stand_beside_one_another(unrender, run: Path, mitsuba_variant: 
     assert {"asset.glb", "environment.exr", "environment.hdr", "obj", "ply", "open_in_blender.py"} <= names
     assert not names & {"scene.xml", "meshes", "textures"}
     compile((run.parent / "home" / "open_in_blender.py").read_text(), "open_in_blender.py", "exec")
-    lit = np.array(mi.Bitmap(str(run.parent / "home" / "environment.exr")))
+    lit = images.read(run.parent / "home" / "environment.exr").values
     np.testing.assert_allclose(lit, 1)
     answer = unrender("export", "problem.toml", "--out", "begin", "--format", "obj", *variant)
     assert answer.status == 0, answer.error

@@ -14,6 +14,7 @@ from zscores import agree
 import unrender as ur
 from tiers import quick
 from unrender.gallery import meshes
+from unrender.io import images
 from unrender.scene.problem import Problem
 
 RUNS, SPP = 24, 32
@@ -117,7 +118,7 @@ def test_a_wrong_texture_is_seen(tmp_path: Path) -> None:
     parameters = elsewhere(problem)
     done = ur.app.export((problem, parameters), tmp_path / "scene")
     (texture,) = (done.folder / "textures").iterdir()
-    pixels = np.array(mi.Bitmap(str(texture)))
+    pixels = images.read(texture).values
     pixels[:4, :4] *= 1.2
     mi.Bitmap(pixels).write(str(texture))
     assert not agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)

@@ -12,6 +12,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from unrender.io import images
 from unrender.runs import final_images, image_sensitivity
 from unrender.runs import map_uncertainty as module
 from unrender.runs.folder import reader as folders
@@ -269,7 +270,6 @@ def test_runs_state_errors_of_the_right_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference_spp: int
 ) -> None:
     """A wall of 400 texels, from noisy and from clean pictures; the run folder, the page and the export have the maps."""
-    import mitsuba as mi
 
     monkeypatch.setattr(final_images, "_SENSITIVITY_SHARE", 100.0)  # also on a busy machine
     made = ur.gallery.problem("wall", resolution=40, texture_resolution=20, reference_spp=reference_spp)
@@ -288,7 +288,7 @@ def test_runs_state_errors_of_the_right_size(
         assert key not in run.record.standard_error
         exported = ur.app.export(tmp_path / "run", tmp_path / "export")
         record = json.loads((exported.folder / "parameters.json").read_text())[key]
-        written = np.array(mi.Bitmap(str(exported.folder / record["standard_error"])))
+        written = images.read(exported.folder / record["standard_error"]).values
         np.testing.assert_allclose(written, run.standard_error[key], rtol=1e-6)
 
 
