@@ -137,8 +137,8 @@ def test_pictures_are_decoded_in_a_few_modules_alone() -> None:
     decoders = {"imread", "imdecode", "imreadmulti", "VideoCapture", "Bitmap", "open"}
     for path in root.rglob("*.py"):
         text = path.read_text()
-        if not any(f".{name}(" in text for name in decoders):
-            continue
+        if not any(f".{name}(" in text for name in decoders - {"open"}) and "Image.open(" not in text:
+            continue  # parsing each file takes seconds
         for node in ast.walk(ast.parse(text)):
             if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
                 continue
