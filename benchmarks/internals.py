@@ -31,9 +31,10 @@ from unrender.gallery.specification import build_problem
 from unrender.gallery.volumes import Smoke
 from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, PlainState
-from unrender.methods import auto, method
+from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import newton
+from unrender.methods.rules import paths as rules_of_paths
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.rendering.expressions import ExpressionRenderer

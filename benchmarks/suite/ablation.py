@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import CachingSession, Plan, RendererWrapper, auto, method, newton
+from benchmarks.internals import CachingSession, Plan, RendererWrapper, method, newton, rules_of_paths
 from benchmarks.runner.records import Record
 
 
@@ -41,8 +41,8 @@ def _without_cache(plan: Plan) -> Plan:
 
 def _without_newton(plan: Plan) -> Plan:
     """Return the plan without the rules that take Gauss-Newton steps for all unknowns, and without such steps after path gradients."""
-    rules = tuple(rule for rule in auto.RULES if rule.__module__ != newton.__name__)
-    with patch.object(auto, "RULES", rules):
+    rules = tuple(rule for rule in rules_of_paths.RULES if rule.__module__ != newton.__name__)
+    with patch.object(rules_of_paths, "RULES", rules):
         made = method("auto").plan(plan.problem)
     if not isinstance(made.estimator, ur.estimators.PathThenNewton):
         return made

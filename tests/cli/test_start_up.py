@@ -98,14 +98,25 @@ def test_a_run_imports_what_its_end_needs_at_its_end() -> None:
 
 def test_a_bad_problem_or_name_is_told_before_what_takes_long_to_import(tmp_path: Path) -> None:
     """An unknown name took 1.4 s of processor time: methods, gallery and Mitsuba were imported first."""
-    files = [tmp_path / name for name in ("none.toml", "number.toml", "scene.toml")]
+    files = [tmp_path / name for name in ("none.toml", "number.toml", "scene.toml", "syntax.toml", "field.toml")]
     files[1].write_text("max_depth = 1.5\n")
     files[2].write_text('scene = "none.xml"\n[[parameters]]\n[[views]]\n')
-    late = {"unrender.methods", "unrender.runs.optimize", "unrender.gallery", "mitsuba", "scipy.special"}
+    files[3].write_text("[[parameters]\n")
+    files[4].write_text('scene = "none.xml"\n[[parameters]]\nbounds = 3\n[[views]]\nreference = "a.exr"\n')
+    late = {
+        "unrender.estimators.base",
+        "unrender.runs.optimize",
+        "unrender.gallery",
+        "mitsuba",
+        "drjit",
+        "scipy.special",
+    }
     lines = [["run", str(file)] for file in files]
     lines += [
         words.split() for words in ("run none", "run wall --method none", "compare none", "compare wall --methods none")
     ]
+    # An option and a field of the file had taken 1.1 and 0.9 s, of Dr.Jit and most of the library.
+    lines += [["run", "wall", *words.split()] for words in ("--set spp=x", "--set none=1", "--variant none")]
     lines += [words.split() for words in ("sweep none", "methods none", "methods --plan none", "gallery none")]
     lines += [[command, str(tmp_path / "none")] for command in ("resume", "report", "judge", "turntable")]
     assert not imported(COMPLAINT.format(lines=lines)) & late

@@ -17,8 +17,8 @@ import unrender as ur
 from tiers import quick
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import Residuals
+from unrender.rendering import AOVS
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.picture_format import AOVS
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.determination import undetermined
 from unrender.runs.verification import misfit

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from unrender.app.evaluation.turntable import turntable
     from unrender.app.exporting.scene_folder import export
 
-__getattr__, _ = lazy.attach(
+__getattr__ = lazy.attach(
     __name__,
     {
         "ImportOptions": "capture.importing",

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from unrender.estimators.path_then_newton import PathThenNewton
     from unrender.estimators.smoothed import SmoothedDerivatives
 
-__getattr__, _ = lazy.attach(
+__getattr__ = lazy.attach(
     __name__,
     {
         "GaussNewton": "gauss_newton",

@@ -196,7 +196,7 @@ def views_of(scene: Any, specification: Specification, aov: str = "") -> list[Vi
 def reference(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> np.ndarray:
     """Return a reference image by Mitsuba's `path` integrator, or `volpath` with media: (H, W, 3) float32. Unbiased up to `max_depth`.
 
-    With an AOV (`picture_format.AOVS`), the image has that property of the first surface in place of radiance.
+    With an AOV (`rendering.AOVS`), the image has that property of the first surface in place of radiance.
 
     It uses the film's reconstruction filter, and `spp` samples or slightly more, in as many equal passes as memory requires. Equal
     arguments give equal images, which are stored in the cache folder (`backend.cache`).

@@ -16,7 +16,7 @@ from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts
 from unrender.gallery.specification import reconstruction
 from unrender.preconditioners import LargeSteps
-from unrender.rendering.picture_format import AOVS
+from unrender.rendering import AOVS
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 

@@ -7,5 +7,5 @@ from unrender.core import lazy
 if TYPE_CHECKING:
     from unrender.io.volumes import Grid, read_grid, write_grid
 
-__getattr__, _ = lazy.attach(__name__, {"Grid": "volumes", "read_grid": "volumes", "write_grid": "volumes"})
+__getattr__ = lazy.attach(__name__, {"Grid": "volumes", "read_grid": "volumes", "write_grid": "volumes"})
 __all__ = ["Grid", "read_grid", "write_grid"]

@@ -5,27 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from unrender import pixels
+from unrender.core import lazy
 from unrender.core.registry import register
-from unrender.estimators.base import Estimator
-from unrender.estimators.path import PathGradient
-from unrender.images.base import Plain
-from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Options, measured, measuring_once
-from unrender.methods.plan import Plan
-from unrender.methods.rules import RULES
+from unrender.methods.paths import estimators, images, optimizers, pixels
 from unrender.methods.rules.constants import CONSTANTS
-from unrender.methods.rules.starts import exchangeable, varied_keys
-from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import SIGMA_HELP
-from unrender.optimizers.base import Optimizer
-from unrender.optimizers.recipes import ScheduleFree
-from unrender.scene.problem import Problem
-from unrender.scene.render import power_of_two
+
+if TYPE_CHECKING:
+    from unrender.estimators.base import Estimator
+    from unrender.methods.plan import Plan
+    from unrender.methods.rules import paths, starts, traits
+    from unrender.optimizers.base import Optimizer
+    from unrender.scene import render
+    from unrender.scene.problem import Problem
+else:  # options are checked without Dr.Jit
+    paths, starts, traits = lazy.modules("methods.rules.paths", "methods.rules.starts", "methods.rules.traits")
+    render = lazy.Module("scene.render")
 
 
 @register(name="auto", position=0)
@@ -89,16 +89,22 @@ class AutoMethod(Options):
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """Return the choices without knowledge of the problem."""
-        image = Plain() if self.image == "plain" else RecursiveControlVariate(max_weight=CONSTANTS.linear_memory)
+        image = (
+            images.Plain()
+            if self.image == "plain"
+            else images.RecursiveControlVariate(max_weight=CONSTANTS.linear_memory)
+        )
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
-        return PathGradient(image, sampler, self.spp or CONSTANTS.spp[0]), ScheduleFree(self.learning_rate)
+        return estimators.PathGradient(image, sampler, self.spp or CONSTANTS.spp[0]), optimizers.ScheduleFree(
+            self.learning_rate
+        )
 
     def plan(self, problem: Problem) -> Plan:
-        traits = Traits(problem, self, CONSTANTS)
-        plan = next(plan for rule in RULES if (plan := rule(traits)) is not None)
-        plan = replace(plan, reasons=(*plan.reasons, *traits.notes, *exchangeable(traits)))
-        few = traits.elements <= CONSTANTS.few_numbers
-        plan = replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan
+        known = traits.Traits(problem, self, CONSTANTS)
+        plan = next(plan for rule in paths.RULES if (plan := rule(known)) is not None)
+        plan = replace(plan, reasons=(*plan.reasons, *known.notes, *starts.exchangeable(known)))
+        few = known.elements <= CONSTANTS.few_numbers
+        plan = replace(plan, other_starts=tuple(starts.varied_keys(problem, list(known.infos)))) if few else plan
         shorter = self._shorter(plan, 0.0)
         return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan
 
@@ -106,12 +112,12 @@ class AutoMethod(Options):
         """Return options with which path gradients take about a share of the time: fewer samples per pixel, or else a mini-batch of pixels
         if noise does not bias the loss. None without such options, as for Gauss-Newton steps, which take at least half of the time then."""
         path = getattr(plan.estimator, "path", plan.estimator)
-        if self.spp or not isinstance(path, PathGradient):
+        if self.spp or not isinstance(path, estimators.PathGradient):
             return None
-        if (spp := max(power_of_two(int(share * path.spp)), CONSTANTS.spp[0])) < path.spp:
+        if (spp := max(render.power_of_two(int(share * path.spp)), CONSTANTS.spp[0])) < path.spp:
             return {"spp": spp}
         (least, batch_spp), count = CONSTANTS.short_batch, plan.problem.pixels
-        drawn = max(power_of_two(int(share * path.spp * count)) // batch_spp, least)
+        drawn = max(render.power_of_two(int(share * path.spp * count)) // batch_spp, least)
         batched = self.image is None and path is plan.estimator and isinstance(path.pixels, pixels.All)
         suits = batched and 4 * drawn <= count and plan.problem.loss.linear
         return {"pixels": drawn, "spp": batch_spp} if suits else None

@@ -7,19 +7,21 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pydantic
 from pydantic import BaseModel, ConfigDict
 
-from unrender.core import registry, tables
+from unrender.core import registry
 from unrender.core.errors import InputError, UnknownOptionError
 from unrender.core.text import did_you_mean, grouped
-from unrender.estimators.base import Estimator
-from unrender.methods.plan import Plan
-from unrender.optimizers.base import Optimizer
-from unrender.scene.problem import Problem
-from unrender.schedules import Schedule
+
+if TYPE_CHECKING:
+    from unrender.estimators.base import Estimator
+    from unrender.methods.plan import Plan
+    from unrender.optimizers.base import Optimizer
+    from unrender.scene.problem import Problem
+    from unrender.schedules import Schedule
 
 SCHEDULE_HELP = "schedule of the learning rate: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 _TOO_LARGE = 1 << 31
@@ -40,6 +42,8 @@ class Options(BaseModel):
 
     def plan(self, problem: Problem) -> Plan:
         """Return the plan for a problem: the result of `build`, unless the method depends on the problem."""
+        from unrender.methods.plan import Plan  # imports Dr.Jit
+
         return Plan(problem, *self.build(), reasons=parameterised(problem))
 
 
@@ -166,6 +170,8 @@ def parse_schedule(text: str | None) -> Schedule | None:
     Raises:
         InputError: an unknown name, or invalid arguments.
     """
+    from unrender.core import tables  # imports NumPy
+
     return None if text is None else tables.parse(text, "schedule")
 
 

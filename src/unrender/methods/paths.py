@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from unrender import pixels
+from unrender.core import lazy
 from unrender.core.registry import register
-from unrender.estimators.base import Estimator
-from unrender.estimators.emitter_selection import EmitterSelection
-from unrender.estimators.meta import MetaEstimator
-from unrender.estimators.path import PathGradient, StockGradient
-from unrender.images.base import ImageEstimator, Plain
-from unrender.images.denoising import Denoised
-from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
-from unrender.optimizers.base import Optimizer
-from unrender.optimizers.recipes import Adam, MetaAdam
-from unrender.pixels.adaptive_counts import AdaptiveCounts
-from unrender.pixels.base import PixelSampler
-from unrender.pixels.uniform import All
-from unrender.statistics import meta
+
+if TYPE_CHECKING:
+    from unrender import estimators, images, optimizers, pixels
+    from unrender.estimators.base import Estimator
+    from unrender.images.base import ImageEstimator
+    from unrender.optimizers.base import Optimizer
+    from unrender.pixels.base import PixelSampler
+else:  # options are checked without Dr.Jit
+    estimators, images, optimizers, pixels = lazy.modules("estimators", "images", "optimizers", "pixels")
 
 
 class AdamOptions(Options):
@@ -38,13 +34,13 @@ class AdamOptions(Options):
     def optimizer(self) -> Optimizer:
         """Return Adam with these options."""
         schedule = parse_schedule(self.schedule)
-        return Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.one_rate)
+        return optimizers.Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.one_rate)
 
 
 class SamplingOptions(AdamOptions):
     """Options of the path sampling of `PathGradient`."""
 
-    emitters: EmitterSelection = Field(
+    emitters: Literal["scene", "adaptive"] = Field(
         "scene",
         description="how a path selects one of several emitters: by the scene's weights, or by the gradient's variance",
     )
@@ -71,9 +67,9 @@ class PathOptions(SamplingOptions):
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """Return the path gradient of the loss at this image estimator's images."""
-        sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
-        image_estimator = Denoised(image) if self.denoise else image
-        return PathGradient(image_estimator, sampler, self.spp, self.adjoint_spp, **self.sampling())
+        sampler = pixels.AdaptiveCounts() if self.counts == "adaptive" else pixels.All()
+        image_estimator = images.Denoised(image) if self.denoise else image
+        return estimators.PathGradient(image_estimator, sampler, self.spp, self.adjoint_spp, **self.sampling())
 
 
 @register(name="plain", position=1)
@@ -81,7 +77,7 @@ class PlainMethod(PathOptions):
     """a new rendering at each step, leave-one-out sample groups, Adam"""
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        return self.estimator(Plain()), self.optimizer()
+        return self.estimator(images.Plain()), self.optimizer()
 
 
 @register(name="rcv", position=2)
@@ -103,7 +99,7 @@ class RecursiveControlVariateMethod(PathOptions):
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        image = RecursiveControlVariate(self.space, self.alpha, self.beta, max_weight=self.max_weight)
+        image = images.RecursiveControlVariate(self.space, self.alpha, self.beta, max_weight=self.max_weight)
         return self.estimator(image), self.optimizer()
 
 
@@ -130,8 +126,10 @@ class AdaptiveMethod(SamplingOptions):
     whole_views: PositiveInt = Field(20, description="steps between two steps of full views, with the image rcv")
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
-        return PathGradient(image, self._sampler(), self.spp, **self.sampling()), self.optimizer()
+        image = (
+            images.Plain() if self.image == "plain" else images.RecursiveControlVariate(whole_views=self.whole_views)
+        )
+        return estimators.PathGradient(image, self._sampler(), self.spp, **self.sampling()), self.optimizer()
 
     def _sampler(self) -> PixelSampler:
         guided: dict[str, Any] = {"refresh": self.refresh}
@@ -151,7 +149,7 @@ class StockMethod(AdamOptions):
     spp: PositiveInt = Field(16, description="samples per pixel of the image, and as many of the adjoint")
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        return StockGradient(self.spp), self.optimizer()
+        return estimators.StockGradient(self.spp), self.optimizer()
 
 
 class MetaCommonOptions(Options):
@@ -166,10 +164,10 @@ class MetaCommonOptions(Options):
         "auto", description="what two steps share: paths, random numbers, or paths if all parameters allow it"
     )
     beta_proportional: FiniteFloat = Field(
-        meta.BETA_PROPORTIONAL, ge=0, lt=1, description="decay of the mean square of the gradient samples"
+        0.99, ge=0, lt=1, description="decay of the mean square of the gradient samples"
     )
     beta_difference: FiniteFloat = Field(
-        meta.BETA_DIFFERENCE, ge=0, lt=1, description="decay of the mean square of their differences per step length"
+        0.9, ge=0, lt=1, description="decay of the mean square of their differences per step length"
     )
     max_weight: FiniteFloat = Field(
         1.0,
@@ -182,8 +180,8 @@ class MetaCommonOptions(Options):
         """Return the optimizer with these options."""
         schedule = parse_schedule(self.schedule)
         if self.optimizer == "adam":
-            return Adam(self.learning_rate, schedule=schedule)
-        return MetaAdam(self.learning_rate, schedule=schedule)
+            return optimizers.Adam(self.learning_rate, schedule=schedule)
+        return optimizers.MetaAdam(self.learning_rate, schedule=schedule)
 
     def shared(self) -> dict[str, Any]:
         """Return the arguments that both forms of `MetaEstimator` share."""
@@ -203,7 +201,7 @@ class MetaMethod(MetaCommonOptions):
 
     def build(self) -> tuple[Estimator, Optimizer]:
         spp, images = (self.proportional_spp, self.difference_spp), self.difference_images
-        return MetaEstimator(*spp, difference_images=images, **self.shared()), self.built_optimizer()
+        return estimators.MetaEstimator(*spp, difference_images=images, **self.shared()), self.built_optimizer()
 
 
 @register(name="coupled", position=4)
@@ -217,7 +215,9 @@ class CoupledMethod(MetaCommonOptions):
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        image = Plain()
+        image = images.Plain()
         if self.image == "rcv":
-            image = RecursiveControlVariate("primary" if self.space == "primary" else "path")
-        return MetaEstimator(coupled=True, spp=self.spp, image=image, **self.shared()), self.built_optimizer()
+            image = images.RecursiveControlVariate("primary" if self.space == "primary" else "path")
+        return estimators.MetaEstimator(
+            coupled=True, spp=self.spp, image=image, **self.shared()
+        ), self.built_optimizer()

@@ -6,21 +6,27 @@ import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from unrender.core import tables
+from unrender.core import lazy
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
-from unrender.estimators.base import Estimator
-from unrender.io import bounded_files, toml_lines
-from unrender.optimizers.base import Optimizer
-from unrender.optimizers.transforms.fitted_sobolev import FittedSobolev
-from unrender.preconditioners.mesh import MeshTopology
-from unrender.scene.coarse_to_fine import CoarseToFine
-from unrender.scene.parameter import ParameterSettings
-from unrender.scene.problem import Problem
+
+if TYPE_CHECKING:
+    from unrender.core import tables
+    from unrender.estimators.base import Estimator
+    from unrender.io import bounded_files, toml_lines
+    from unrender.optimizers import transforms
+    from unrender.optimizers.base import Optimizer
+    from unrender.preconditioners.mesh import MeshTopology
+    from unrender.scene import coarse_to_fine, parameter
+    from unrender.scene.parameter import ParameterSettings
+    from unrender.scene.problem import Problem
+else:  # methods are listed without Dr.Jit
+    tables, transforms, bounded_files = lazy.modules("core.tables", "optimizers.transforms", "io.bounded_files")
+    toml_lines, coarse_to_fine, parameter = lazy.modules("io.toml_lines", "scene.coarse_to_fine", "scene.parameter")
 
 _COMPONENTS = ("estimator", "optimizer")
 
@@ -115,7 +121,7 @@ def bind(part: Any, topology: Callable[[str], MeshTopology | None], repeated: Ma
 
     Every `FittedSobolev` is bound, wherever it is among the fields of the optimizer and its parts.
     """
-    if isinstance(part, FittedSobolev):
+    if isinstance(part, transforms.FittedSobolev):
         return part.bound(topology, repeated)
     if isinstance(part, tuple):
         parts = tuple(bind(each, topology, repeated) for each in part)
@@ -164,20 +170,21 @@ def _settings_table(own: ParameterSettings) -> dict[str, Any]:
 
 def _settings(table: Any, where: str) -> ParameterSettings:
     """Return the settings of a table. Raises `InputError`."""
-    if not isinstance(table, Mapping) or set(table) - set(vars(ParameterSettings())):
-        raise InputError(f"{where}: expected {', '.join(vars(ParameterSettings()))}, got {repr(table)[:60]}")
+    if not isinstance(table, Mapping) or set(table) - set(vars(parameter.ParameterSettings())):
+        raise InputError(f"{where}: expected {', '.join(vars(parameter.ParameterSettings()))}, got {repr(table)[:60]}")
     made: dict[str, Any] = dict(table)
     if "preconditioner" in made:
         made["preconditioner"] = tables.component(made["preconditioner"], "preconditioner", where=where)
     try:
         if "coarse_to_fine" in made:
-            made["coarse_to_fine"] = tables.options(CoarseToFine, made["coarse_to_fine"], "{ steps = [100] }")
-        return ParameterSettings(**made)
+            made["coarse_to_fine"] = tables.options(
+                coarse_to_fine.CoarseToFine, made["coarse_to_fine"], "{ steps = [100] }"
+            )
+        return parameter.ParameterSettings(**made)
     except InputError as error:
         raise InputError(f"{where}: {str(error).removeprefix('settings: ')}") from error
 
 
-SUFFIX = ".toml"
 _LONGEST = 1 << 20
 
 

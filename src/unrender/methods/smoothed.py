@@ -5,32 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import pydantic
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
-from unrender import optimizers, pixels
+from unrender.core import lazy
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean
-from unrender.core.trees import Tree
-from unrender.estimators.base import Estimator
-from unrender.estimators.hybrid import HybridGradient, beyond_paths
-from unrender.estimators.loss_values import LossValues
-from unrender.estimators.meta import MetaEstimator
-from unrender.estimators.path import PathGradient
-from unrender.estimators.smoothed import SmoothedDerivatives
-from unrender.images.base import ImageEstimator, Plain
-from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Options, parameterised, parse_schedule
-from unrender.methods.paths import AdamOptions
-from unrender.methods.plan import Plan
-from unrender.optimizers.base import Optimizer
-from unrender.optimizers.recipes import Adam, MetaAdam
-from unrender.pixels.base import PixelSampler
-from unrender.scene.problem import Problem
+from unrender.methods.paths import AdamOptions, estimators, images, optimizers, pixels
+
+if TYPE_CHECKING:
+    from unrender.core.trees import Tree
+    from unrender.estimators import hybrid
+    from unrender.estimators.base import Estimator
+    from unrender.images.base import ImageEstimator
+    from unrender.methods import plan as plans
+    from unrender.optimizers.base import Optimizer
+    from unrender.pixels.base import PixelSampler
+    from unrender.scene.problem import Problem
+else:  # options are checked without Dr.Jit
+    hybrid, plans = lazy.modules("estimators.hybrid", "methods.plan")
 
 SIGMA_HELP = "smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6; none for 0.2 times their size"
 WIDTH = 0.2
@@ -68,10 +65,10 @@ class SmoothedMethod(Options):
         """Return both parts for parameters whose sizes are of the order of 1."""
         return self._parts(parse_widths(WIDTH if self.sigma is None else self.sigma), {})
 
-    def plan(self, problem: Problem) -> Plan:
+    def plan(self, problem: Problem) -> plans.Plan:
         sigma, first = parse_widths(self.sigma, problem), first_steps(self.sigma, problem, problem.shapes())
         own = first if set(first.values()) - {_common(sigma)} else {}
-        return Plan(problem, *self._parts(sigma, own), reasons=parameterised(problem))
+        return plans.Plan(problem, *self._parts(sigma, own), reasons=parameterised(problem))
 
     def _parts(self, sigma: float | dict[str, float], own: Mapping[str, float]) -> tuple[Estimator, Optimizer]:
         """Return both parts; `own`: widths of the optimizer's variables, by which the first steps of adam and cma-es are scaled."""
@@ -79,14 +76,16 @@ class SmoothedMethod(Options):
         common = _common(sigma)
         units: dict[str, float] = {"*": 1.0} | {key: width / common for key, width in own.items()}
         if self.optimizer == "cma-es":
-            return LossValues(self.spp), optimizers.CMAES(
+            return estimators.LossValues(self.spp), optimizers.CMAES(
                 sigma0=self.step * common, learning_rate=units if own else 1.0
             )
         scaled = {key: self.step * common * unit for key, unit in units.items()}
         rate = scaled if own else self.step * common
         order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
         joint = self.joint or order == "gradient"
-        estimator = SmoothedDerivatives(sigma, self.samples, order, joint=joint, spp=self.spp, schedule=schedule)
+        estimator = estimators.SmoothedDerivatives(
+            sigma, self.samples, order, joint=joint, spp=self.spp, schedule=schedule
+        )
         made: dict[str, Callable[[], Optimizer]] = {
             "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
             "newton": lambda: optimizers.Newton(trust_radius=self.step),
@@ -128,15 +127,15 @@ class HybridMethod(AdamOptions):
         widths = parse_widths(WIDTH if self.sigma is None else self.sigma)
         return self._parts("path" if self.space is None else self.space, widths, {})
 
-    def plan(self, problem: Problem) -> Plan:
+    def plan(self, problem: Problem) -> plans.Plan:
         known, keys = problem.renderer.parameters(), list(problem.shapes())
-        own = beyond_paths(known, keys) if self._keys is None else self._keys
+        own = hybrid.beyond_paths(known, keys) if self._keys is None else self._keys
         space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
         widths = widths_of(self.sigma, problem, [key for key in own if key in keys])
         rates = {key: self.step * width for key, width in first_steps(self.sigma, problem, widths).items()}
         reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
         wanted = parse_widths(self.sigma, problem, tuple(widths))
-        return Plan(problem, *self._parts(space, wanted, rates), reasons=(reason,) if own else ())
+        return plans.Plan(problem, *self._parts(space, wanted, rates), reasons=(reason,) if own else ())
 
     @property
     def _keys(self) -> tuple[str, ...] | None:
@@ -145,8 +144,10 @@ class HybridMethod(AdamOptions):
     def _parts(
         self, space: Literal["path", "primary"], widths: float | dict[str, float], rates: Tree
     ) -> tuple[Estimator, Optimizer]:
-        image = Plain() if self.image == "plain" else RecursiveControlVariate(space, max_weight=_IMAGE_MEMORY)
-        smoothing = SmoothedDerivatives(
+        image = (
+            images.Plain() if self.image == "plain" else images.RecursiveControlVariate(space, max_weight=_IMAGE_MEMORY)
+        )
+        smoothing = estimators.SmoothedDerivatives(
             widths,
             self.samples,
             spp=self.perturbed_spp,
@@ -154,22 +155,22 @@ class HybridMethod(AdamOptions):
             debiased=self.perturbed_spp > 1,
         )
         path, optimizer = self._path(image, space), self.optimizer()
-        if rates and isinstance(optimizer, (Adam, MetaAdam)):
+        if rates and isinstance(optimizer, (optimizers.Adam, optimizers.MetaAdam)):
             optimizer = replace(optimizer, learning_rate={"*": self.learning_rate, **rates})
-        return HybridGradient(path, smoothing, self._keys, averaged=self.gradient == "coupled"), optimizer
+        return estimators.HybridGradient(path, smoothing, self._keys, averaged=self.gradient == "coupled"), optimizer
 
     def _path(self, image: ImageEstimator, space: Literal["path", "primary"]) -> Estimator:
         sampler: PixelSampler = pixels.Adaptive(self.pixels) if self.pixels else pixels.All()
         if self.gradient == "coupled":
-            return MetaEstimator(
+            return estimators.MetaEstimator(
                 coupled=True, spp=self.spp, image=image, space=space, pixels=sampler, max_weight=_GRADIENT_MEMORY
             )
-        return PathGradient(image, sampler, self.spp)
+        return estimators.PathGradient(image, sampler, self.spp)
 
     def optimizer(self) -> Optimizer:
         """Return Adam, or MetaAdam for a meta-estimated gradient."""
         if self.gradient == "coupled":
-            return MetaAdam(self.learning_rate, schedule=parse_schedule(self.schedule))
+            return optimizers.MetaAdam(self.learning_rate, schedule=parse_schedule(self.schedule))
         return super().optimizer()
 
 
@@ -217,7 +218,7 @@ def first_steps(sigma: float | str | None, problem: Problem, keys: Iterable[str]
     widths = widths_of(sigma, problem, keys)
     known = {key: problem.unknowns[key] for key in widths}
     slopes = {k: u.transform.slope(u.project(u.initial)) for k, u in known.items() if u.transform is not None}
-    return {k: width / float(np.max(slopes[k])) if k in slopes else width for k, width in widths.items()}
+    return {k: width / float(slopes[k].max()) if k in slopes else width for k, width in widths.items()}
 
 
 def _common(sigma: float | Mapping[str, float]) -> float:
@@ -228,7 +229,7 @@ def _common(sigma: float | Mapping[str, float]) -> float:
 def _size(problem: Problem, key: str) -> float:
     """Return the order of magnitude of a parameter's size, a power of ten; 1 for a value of 0 without bounds."""
     unknown, info = problem.unknowns[key], problem.renderer.parameters()[key]
-    (low, high), largest = unknown.bounds, float(np.abs(unknown.initial).max(initial=0.0))
+    (low, high), largest = unknown.bounds, float(abs(unknown.initial).max(initial=0.0))
     if info.rigid:
         return info.length
     if low is not None and high is not None:

@@ -8,9 +8,6 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from unrender.rendering.renderer import Renderer
 
-AOVS = ("depth", "position", "sh_normal", "albedo", "mask")
-"""Properties of the first visible surface that can be rendered in place of radiance, by the names of Mitsuba's `aov` integrator."""
-
 
 @dataclass(frozen=True)
 class PictureFormat:
@@ -20,7 +17,7 @@ class PictureFormat:
         colour: "rgb" (linear), "luminance" or "xyz". Images of the renderer are RGB; "luminance" makes all three channels equal.
         signed: whether pixels may be negative, because of negative lobes of the filter, colours of spectra outside sRGB, or
             because the images are not radiance.
-        aov: property of the first surface in place of radiance, one of `AOVS`; "" for radiance.
+        aov: property of the first surface in place of radiance, one of `rendering.AOVS`; "" for radiance.
         stores_alpha: whether the film stores alpha, which images of the renderer do not have.
     """
 

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from unrender.runs.live import Live
     from unrender.runs.map_uncertainty import uncertainty
 
-__getattr__, _ = lazy.attach(
+__getattr__ = lazy.attach(
     __name__, {"Live": "live", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"}
 )
 __all__ = ["Live", "sensitivity", "uncertainty"]

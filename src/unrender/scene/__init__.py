@@ -7,5 +7,5 @@ from unrender.core import lazy
 if TYPE_CHECKING:
     from unrender.scene.coarse_to_fine import CoarseToFine
 
-__getattr__, _ = lazy.attach(__name__, {"CoarseToFine": "coarse_to_fine"})
+__getattr__ = lazy.attach(__name__, {"CoarseToFine": "coarse_to_fine"})
 __all__ = ["CoarseToFine"]

@@ -34,18 +34,22 @@ Paths are relative to the file. Only `scene`, `key` (or `keys`) and `reference` 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.core import checks, tables
+from unrender.core import checks, lazy
 from unrender.io import bounded_files, confinement, toml_lines
 from unrender.io.toml_lines import FieldError, Table
-from unrender.rendering.picture_format import AOVS
-from unrender.scene import coarse_to_fine
-from unrender.scene.parameter import Parameter
-from unrender.scene.problem import Problem
-from unrender.scene.references import View
+from unrender.rendering import AOVS
+
+if TYPE_CHECKING:
+    from unrender.core import tables
+    from unrender.scene import coarse_to_fine, parameter, references
+    from unrender.scene import problem as problems
+else:  # fields are checked without Dr.Jit
+    tables, coarse_to_fine, parameter = lazy.modules("core.tables", "scene.coarse_to_fine", "scene.parameter")
+    references, problems = lazy.modules("scene.references", "scene.problem")
 
 _Number = StrictFloat | StrictInt
 
@@ -118,7 +122,7 @@ TABLES: dict[str, type[Table]] = {"": _Problem, "parameters": _Parameter, "views
 """Models of a problem file's tables, by name; "" is the file itself."""
 
 
-def read(path: str | Path, partial: bool = False) -> Problem:
+def read(path: str | Path, partial: bool = False) -> problems.Problem:
     """Return the problem of a TOML file. Raises `InputError`, "problem.toml:12: parameters[0].bounds: ...", with the expected value."""
     file = checks.path("problem", path, "a problem file")
     model, text = _read_model(file)
@@ -147,13 +151,13 @@ def _read_model(file: Path) -> tuple[_Problem, str]:
     return toml_lines.read(file, _Problem, {"parameters": _Parameter, "views": _View})
 
 
-def _build(model: _Problem, file: Path, partial: bool) -> Problem:
+def _build(model: _Problem, file: Path, partial: bool) -> problems.Problem:
     folder = file.parent
     with FieldError.at(("loss",)):
         loss = tables.component(model.loss, "loss", folder=folder)
     parameters = [_parameter(index, parameter, folder) for index, parameter in enumerate(model.parameters)]
     truths = zip(parameters, [parameter.truth for parameter in model.parameters], strict=True)
-    return Problem(
+    return problems.Problem(
         folder / model.scene,
         parameters,
         [_view(view, folder) for view in model.views],
@@ -166,13 +170,13 @@ def _build(model: _Problem, file: Path, partial: bool) -> Problem:
     )
 
 
-def _view(model: _View, folder: Path) -> View:
+def _view(model: _View, folder: Path) -> references.View:
     known = None if model.known is None else {key: _value(value, folder) for key, value in model.known.items()}
     mask, scene = (None if name is None else folder / name for name in (model.mask, model.scene))
-    return View(folder / model.reference, model.sensor, model.weight, mask, known, scene, model.aov)
+    return references.View(folder / model.reference, model.sensor, model.weight, mask, known, scene, model.aov)
 
 
-def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
+def _parameter(index: int, model: _Parameter, folder: Path) -> parameter.Parameter:
     if not model.key and not model.keys:
         raise FieldError(
             ("parameters", index, "key"), "missing, expected the name of a scene parameter, or several names as keys"
@@ -186,7 +190,7 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         if own[name] is not None:
             with FieldError.at(("parameters", index, name)):
                 own[name] = convert(own[name])
-    return Parameter(**own | {"initial": _value(model.initial, folder)})
+    return parameter.Parameter(**own | {"initial": _value(model.initial, folder)})
 
 
 def _value(value: Any, folder: Path) -> Any:

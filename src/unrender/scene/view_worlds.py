@@ -14,9 +14,10 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, listed
 from unrender.io import parameter_values
 from unrender.io.toml_lines import FieldError
+from unrender.rendering import AOVS
 from unrender.rendering.expressions import are_storable, expression_layer
 from unrender.rendering.photographs import scene_members, scene_renderer
-from unrender.rendering.picture_format import AOVS, AovRenderer
+from unrender.rendering.picture_format import AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.turns import TurnsLights, turns_of, with_scene
 from unrender.rendering.worlds import World, with_worlds, worlds_of

@@ -97,8 +97,6 @@ def methods(
         return
     if unused := arguments.typed_options(context):
         raise InputError(f"methods: {unused[0]} needs --plan PROBLEM")
-    if name:
-        registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
     from unrender.methods import methods as registered
 
@@ -114,7 +112,6 @@ def _print_plan(
 ) -> None:
     options = arguments.settings(problem_settings, "--problem-set")
     arguments.check_file(problem)
-    registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
     from unrender.methods.plan import plan_text
 

@@ -15,15 +15,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from unrender.backend import cache, variant
-from unrender.core import phases, registry
+from unrender.core import lazy, phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import LARGEST_SEED
 from unrender.core.text import did_you_mean
 from unrender.io import confinement
 
 if TYPE_CHECKING:
+    from unrender import gallery
     from unrender.app.distributed.cluster import Workers
+    from unrender.app.stages import stages_file
+    from unrender.io import bounded_files, files
+    from unrender.scene import toml_file
     from unrender.scene.problem import Problem
+else:  # imported when a command needs them
+    gallery, stages_file, toml_file = lazy.modules("gallery", "app.stages.stages_file", "scene.toml_file")
+    bounded_files, files = lazy.modules("io.bounded_files", "io.files")
 
 DEFAULT_STEPS = 300
 MOST_SAMPLES, MOST_SEEDS, MOST_TRIALS = 1 << 24, 10_000, 100_000
@@ -184,19 +191,13 @@ def check_file(name: str, options: Mapping[str, str] = MappingProxyType({})) -> 
     missing or has invalid fields, before the slow imports."""
     _check_known(name)
     if options and is_gallery(name):
-        from unrender import gallery
-
         gallery.check(name, {key: literal(value) for key, value in options.items()})
     file = Path(name)
     if file.suffix.lower() != ".toml":
         return
     if not file.exists():
-        from unrender.io import bounded_files  # imports NumPy
-
         raise InputError(f"{name}: {bounded_files.no_file(file)}")
     if not is_stages(name):
-        from unrender.scene import toml_file
-
         toml_file.check(file)
 
 
@@ -219,8 +220,6 @@ def check_problem(name: str, options: Mapping[str, str], cached: bool = True) ->
         if not cached:
             raise InputError("--no-cache: only the references of gallery problems are cached; leave it out")
         if not Path(name).exists():
-            from unrender.io import bounded_files  # imports NumPy
-
             raise InputError(f"{name}: {bounded_files.no_file(Path(name))}")
         refuse_stages(name)
 
@@ -247,11 +246,7 @@ def _in_folder(folder: Path) -> str:
 
 def is_stages(name: str) -> bool:
     """Return whether the argument PROBLEM is a file of stages."""
-    if Path(name).suffix.lower() not in ("", ".toml") or not Path(name).is_file():
-        return False
-    from unrender.app.stages import stages_file
-
-    return stages_file.is_stages(Path(name))
+    return Path(name).suffix.lower() in ("", ".toml") and Path(name).is_file() and stages_file.is_stages(Path(name))
 
 
 def refuse_stages(file: str) -> None:
@@ -263,7 +258,6 @@ def refuse_stages(file: str) -> None:
 def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
     """Open the problem of a TOML file or of the gallery, its references `cached` or not. A variant must be active. Raise `InputError`."""
     with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():
-        from unrender import gallery
         from unrender.scene.problem import Problem
 
         check_problem(name, options)
@@ -326,8 +320,6 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
                 raise InputError(f"--out {out}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
                 raise InputError(f"--out {out}: contains earlier results; give --overwrite to replace them")
-        from unrender.io import files  # imports NumPy
-
         files.make_folder(out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror or error}") from error
@@ -356,8 +348,6 @@ def check_folder(directory: Path) -> None:
 
 def finished_run(directory: Path) -> Path:
     """Return the folder itself or, for a run in stages, the run folder of the last stage that has started. Raise `InputError`."""
-    from unrender.app.stages import stages_file
-
     return stages_file.last_result(directory)
 
 

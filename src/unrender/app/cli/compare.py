@@ -15,21 +15,24 @@ import typer
 from unrender.app.cli import arguments
 from unrender.app.cli.run import exit_status
 from unrender.app.cli.signals import DOUBTFUL, FAILED
-from unrender.core import phases, registry
+from unrender.core import lazy, phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns, plain
 
 if TYPE_CHECKING:
+    from unrender.app.cli import tasks
     from unrender.app.cli.tasks import Job, RunTask
     from unrender.app.distributed.cluster import Cluster, Ended, Workers
     from unrender.app.report.equal_time import Comparison, Spread
     from unrender.app.sweeps.record import RunOutcome
     from unrender.methods import Method
+    from unrender.runs.folder import schema
     from unrender.runs.progress import Progress
     from unrender.scene.problem import Problem
-
+else:  # imported when a command needs them
+    tasks, schema = lazy.modules("app.cli.tasks", "runs.folder.schema")
 
 DEFAULT_SECONDS = 20.0
 _DEFAULT = ("stock", "auto")  # default methods: the standard Mitsuba loop, and the automatic choice
@@ -184,7 +187,6 @@ def _run_all(
     """Carry out the runs, here or on workers, until one is interrupted. Return the folders of runs that took a step, and `status_of`
     all."""
     from unrender.app.cli.execute import introduce
-    from unrender.runs.folder import schema
 
     folder = Path(job.folder)
     with contextlib.ExitStack() as stack:
@@ -213,8 +215,6 @@ def status_of(outcomes: Sequence[RunOutcome]) -> int:
 
     A run that does not fit is doubtful only if no other run fits: a method that stalls is a result of the comparison.
     """
-    from unrender.runs.folder import schema
-
     interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
     if interrupted:
         return exit_status(interrupted[0].stopped)
@@ -227,8 +227,6 @@ def status_of(outcomes: Sequence[RunOutcome]) -> int:
 def _here(
     console: Console, progress: Progress, job: Job, runs: Sequence[RunTask], problem: Problem
 ) -> list[RunOutcome]:
-    from unrender.app.cli import tasks
-
     outcomes: list[RunOutcome] = []
     for run in runs:
         limits = (f"{limit:g} {unit}" for unit, limit in (("steps", run.steps), ("s", run.seconds)) if limit)
@@ -242,7 +240,6 @@ def _here(
 def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cluster) -> list[RunOutcome]:
     """Run as many runs concurrently as there are workers. A failed run is reported in one line, and the others continue. After an
     interrupt, return the completed runs, and the state of the others if they saved it within seconds."""
-    from unrender.app.cli import tasks
     from unrender.app.cli.tasks import TaskDisplay
     from unrender.app.distributed.cluster import OnWorkers
     from unrender.app.sweeps.record import RunOutcome
@@ -289,8 +286,6 @@ def _methods_and_settings(names: str | None, typed: Mapping[str, str]) -> dict[s
 
 def _parse_methods(names: str | None) -> list[Method]:
     listed = _DEFAULT if names is None else [name.strip() for name in names.split(",") if name.strip()]
-    for name in listed:
-        registry.check_name("method", name)  # before the slow imports
     from unrender.methods import method
 
     chosen = [method(name) for name in listed]

@@ -11,10 +11,10 @@ import typer
 from unrender.app.cli import arguments
 from unrender.app.cli.arguments import AllowOutside, Overwrite, Variant
 from unrender.core.errors import InputError
+from unrender.display.terminal import Console
 
 if TYPE_CHECKING:
     from unrender.app.capture.importing import Imported
-    from unrender.display.terminal import Console
 
 
 _Folder = Annotated[
@@ -113,7 +113,6 @@ def import_(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Write a problem from posed photographs: scene, undistorted references, masks, a first shape, problem.toml, held-out.toml."""
-    from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)

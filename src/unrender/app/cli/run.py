@@ -12,12 +12,12 @@ import typer
 
 from unrender.app.cli import arguments, stages
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
-from unrender.core import phases, registry
+from unrender.core import phases
 from unrender.core.errors import InputError
+from unrender.display.terminal import Console
 
 if TYPE_CHECKING:
     from unrender.app.distributed.cluster import Workers
-    from unrender.display.terminal import Console
     from unrender.methods import Method
     from unrender.methods.plan import PlanFile
     from unrender.runs.folder.schema import RunRecord
@@ -98,7 +98,6 @@ def run(
     steps, seconds = _budget_settings(values, steps, seconds)
     budget = arguments.budget(steps, seconds)
     arguments.check_file(problem, options)
-    from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console, command = Console(highlight=False), arguments.command_line(context)
@@ -109,8 +108,8 @@ def run(
             first = seed if "--seed" in arguments.typed_options(context) else None
             plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp
             return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
-        chosen.start(values)
         arguments.check_variant(variant)
+        chosen.start(values)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
             with phases.phase("loading"):
@@ -132,11 +131,12 @@ def run(
 
 def _method(name: str) -> Method | PlanFile:
     if not name.endswith(".toml"):
-        registry.check_name("method", name)  # before the slow imports
-    from unrender.methods import method
-    from unrender.methods.plan import SUFFIX, PlanFile
+        from unrender.methods import method
 
-    return PlanFile(Path(name)) if name.endswith(SUFFIX) else method(name)
+        return method(name)
+    from unrender.methods.plan import PlanFile
+
+    return PlanFile(Path(name))
 
 
 def conclude(
@@ -218,7 +218,6 @@ def resume(
     It continues from its last checkpoint and gives the result of an uninterrupted run up to rounding; with --threads 1 and the same
     number of workers, bit for bit. For a run in stages, --steps and --seconds are a new budget of all stages.
     """
-    from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)

@@ -15,20 +15,26 @@ import typer
 
 from unrender.app.cli import arguments
 from unrender.app.cli.signals import DOUBTFUL
-from unrender.core import phases
+from unrender.core import lazy, phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from unrender import methods
+    from unrender.app.stages import stages_file
     from unrender.app.stages.stage_problem import StagedProblem
     from unrender.app.stages.stages_file import RunOptions, Stages
     from unrender.display.terminal import Console
+    from unrender.runs.folder import reader, schema
     from unrender.runs.folder.lock import Lock
     from unrender.runs.progress import Progress
     from unrender.runs.result import Result
     from unrender.scene.problem import Problem
+else:  # imported when a command needs them
+    methods, stages_file = lazy.modules("methods", "app.stages.stages_file")
+    reader, schema = lazy.modules("runs.folder.reader", "runs.folder.schema")
 
 _SCENES = "scenes"
 
@@ -85,9 +91,6 @@ def begin(
 
     None as `seed`, and a budget of two None, select the file's values.
     """
-    from unrender.app.stages import stages_file
-    from unrender.methods import method
-
     stages = stages_file.read(file)
     if budget != (None, None):
         stages = replace(stages, steps=budget[0], seconds=budget[1])
@@ -96,7 +99,7 @@ def begin(
     check_seed("seed", stages.seed, len(stages.stages))
     for stage in stages.stages:
         try:
-            chosen, settings = method(stage.method or stages.method), stages.settings_of(stage)
+            chosen, settings = methods.method(stage.method or stages.method), stages.settings_of(stage)
             if stages.settings:  # those that stages share may have no effect in this one
                 chosen.configure(settings).build()
             else:
@@ -125,9 +128,6 @@ def reopen(
     folder: Path, budget: tuple[int | None, float | None], variant: str | None, threads: int | None, command: str
 ) -> StagesRun:
     """Return an earlier run in stages. None, and a budget of two None, select the run's own values. Raise `InputError`."""
-    from unrender.app.stages import stages_file
-    from unrender.runs.folder import schema
-
     file = folder / stages_file.FILE
     stages = stages_file.read(file)
     if not stages_file.is_of_run(file):
@@ -182,8 +182,6 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
     from rich.markup import escape
 
     from unrender.app.cli.run import conclude
-    from unrender.app.stages import stages_file
-    from unrender.runs.folder import reader, schema
 
     values: dict[str, np.ndarray] = {}
     doubtful = False
@@ -213,10 +211,7 @@ def _run_stage(
     run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
 ) -> tuple[Problem, Result]:
     from unrender.app.cli.execute import RunOrder, execution, introduce, resumed
-    from unrender.app.stages import stages_file
-    from unrender.methods import method
     from unrender.runs import reopen as runs
-    from unrender.runs.folder import schema
     from unrender.runs.optimize import optimize
     from unrender.runs.resume import load_run
 
@@ -233,7 +228,7 @@ def _run_stage(
     introduce(console, problem, run.variant)
     steps, seconds = stages_file.split(stages)[index]
     settings = stages.settings_of(stage)
-    chosen = method(stage.method or stages.method)
+    chosen = methods.method(stage.method or stages.method)
     shared = chosen.with_effect(problem, settings)  # those of all stages may have none in this one
     for key in [key for key in settings if key not in shared and key not in stage.settings]:
         console.say(f"setting {key}={settings.pop(key)}: it has no effect in this stage, and is left out")
@@ -253,15 +248,11 @@ def _read(stages: Stages) -> StagedProblem:
 
 
 def _status(folder: Path) -> str:
-    from unrender.runs.folder import reader, schema
-
     return reader.read_run_record(folder).status if (folder / schema.RECORD).is_file() else ""
 
 
 def _clear(out: Path) -> None:
     """Remove the scenes and run folders of an earlier run in stages. Raise `InputError` if a process holds one."""
-    from unrender.runs.folder import schema
-
     old = [
         path
         for path in sorted(out.glob("[0-9]*-*"))

@@ -12,13 +12,14 @@ from unrender.app.cli import arguments
 from unrender.core import phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
+from unrender.core.text import did_you_mean
+from unrender.display.terminal import Console
 
 if TYPE_CHECKING:
     from unrender.app.cli.sweep_driver import Session
     from unrender.app.distributed.cluster import Workers
     from unrender.app.sweeps.record import SweepPlan, SweepRecord
     from unrender.app.sweeps.search import Search
-    from unrender.display.terminal import Console
 
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
@@ -93,7 +94,6 @@ def sweep_command(
         registry.check_name("method", method_name)  # before the slow imports
     from unrender.app.cli.sweep_driver import Session, run_trials
     from unrender.app.sweeps.record import read_sweep
-    from unrender.display.terminal import Console
 
     console = Console(highlight=False)
     where = arguments.workers(workers, insecure)
@@ -180,7 +180,6 @@ def _run_silently(
     from unrender.app.cli.signals import DOUBTFUL, FAILED
     from unrender.app.cli.sweep_driver import Session
     from unrender.app.sweeps.record import read_sweep
-    from unrender.display.terminal import Console
 
     try:
         session = Session(folder, workers, threads, fresh=True)
@@ -232,8 +231,6 @@ def _begin(console: Console, planned: tuple[SweepPlan, Search], command: str, se
 
 
 def _kind(search: str | None, axes: Any) -> Any:
-    from unrender.core.text import did_you_mean
-
     if search is None:
         try:
             return "grid" if all(axis.points() for axis in axes) else "random"

@@ -25,16 +25,21 @@ from __future__ import annotations
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tomli_w
 from pydantic import ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 from pydantic.dataclasses import dataclass
 
+from unrender.core import lazy
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files, toml_lines
 from unrender.io.toml_lines import Place
-from unrender.runs.folder import schema
+
+if TYPE_CHECKING:
+    from unrender.runs.folder import schema
+else:  # a file is told to have stages without Dr.Jit
+    schema = lazy.Module("runs.folder.schema")
 
 FILE = "stages.toml"
 """Name of the file in the folder of an import, and in that of a run in stages."""

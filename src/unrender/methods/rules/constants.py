@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from unrender.estimators.derivative_images import MOST_AVERAGED
-from unrender.preconditioners import Sobolev
-
 
 @dataclass(frozen=True)
 class Constants:
@@ -42,8 +39,8 @@ class Constants:
     """κ of Gauss-Newton steps for linear losses, because 0 is not allowed there. Source: by hand."""
     fresh_from: int = 12
     """Step from which new gradients are used to test whether detail is smoothed away. Source: `suite`, `painting` (7526aba)."""
-    correlation: float = Sobolev().correlation
-    """Largest smoothing length of Sobolev gradients relative to a side. Source: `suite`."""
+    correlation: float = 0.125
+    """Largest smoothing length of Sobolev gradients relative to a side, that of `Sobolev`. Source: `suite`."""
 
     number_size: int = 4
     """Largest number of elements of a number or colour. Source: fact, a colour has three channels and a spectrum of this library four."""
@@ -181,7 +178,7 @@ class Constants:
     """
     derivative_noise: float = 1.0
     """`GaussNewton.derivative_noise` after path gradients, where derivative images take most of a step. Source: by hand."""
-    averaged_values: int = MOST_AVERAGED
+    averaged_values: int = 1 << 19
     """Elements times pixels up to which the derivative images of such steps are averaged over steps. Source: memory, 12 MiB."""
     pose_averaging: float = 3.0
     """`averaging` of poses, whose first models are far from the solution. Source: as for `pose_shift`."""

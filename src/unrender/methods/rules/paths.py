@@ -24,7 +24,7 @@ from unrender.images.base import Plain
 from unrender.methods.base import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules.constants import CONSTANTS, Constants
-from unrender.methods.rules.newton import then_newton, with_separate_block
+from unrender.methods.rules.newton import cameras, cameras_by_paths, few_numbers, then_newton, with_separate_block
 from unrender.methods.rules.traits import Traits, choose_image, choose_sampler, refusal, samples_per_pixel
 from unrender.methods.smoothed import first_steps, parse_widths
 from unrender.optimizers.base import Optimizer
@@ -180,6 +180,9 @@ def perturbed(traits: Traits) -> Plan | None:
 def paths_then_newton(traits: Traits) -> Plan:
     """Return path gradients, with Gauss-Newton steps after them for few numbers."""
     return then_newton(traits, paths(traits))
+
+
+RULES = (cameras, cameras_by_paths, few_numbers, paths_and_perturbed, perturbed, paths_then_newton)
 
 
 def paths(traits: Traits) -> Plan:
