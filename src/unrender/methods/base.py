@@ -271,12 +271,8 @@ def choices(options: BaseModel, name: str) -> list[Any]:
     """Return the other values of an option with a few values; [] for numbers and texts."""
     schema, own = type(options).model_json_schema()["properties"][name], getattr(options, name)
     kinds = schema.get("anyOf", [schema])
-    values = [value for kind in kinds for value in (kind.get("enum") or _booleans(kind))]
+    values = [x for kind in kinds for x in kind.get("enum") or [True, False] * (kind.get("type") == "boolean")]
     return [value for value in values if value != own]
-
-
-def _booleans(kind: dict[str, Any]) -> list[bool]:
-    return [True, False] if kind.get("type") == "boolean" else []
 
 
 def _changed(options: BaseModel, name: str, value: Any) -> BaseModel | None:

@@ -26,7 +26,7 @@ from unrender.rendering.renderer import (
     WithCameras,
     differentiated,
 )
-from unrender.rendering.wrapper import SessionWrapper
+from unrender.rendering.wrapper import DerivedSession
 
 POSES = "poses"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
@@ -151,18 +151,16 @@ class PosedPaths:
     sensors: tuple[int, ...]
 
 
-class PosedCamerasSession(SessionWrapper):
+class PosedCamerasSession(DerivedSession):
     """A session that renders and differentiates with respect to the cameras' poses and the inner session's parameters."""
 
     def __init__(self, renderer: PosedCameras, inner: RenderSession):
-        super().__init__(inner)
+        super().__init__(inner, {POSES})
         self._renderer = renderer
-        self._trees: list[tuple[Array, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        rest = {key: value for key, value in parameters.items() if key != POSES}
-        poses = self._renderer.corrections.poses(np.asarray(parameters[POSES]))
-        return self._inner.image_batch({**rest, **poses}, request)
+        own, rest = self._split(parameters)
+        return self._inner.image_batch({**rest, **self._renderer.corrections.poses(np.asarray(own[POSES]))}, request)
 
     def _shown(self, rendering: Rendering, request: SampleRequest) -> Rendering:
         return replace(rendering, paths=PosedPaths(rendering.paths, _sensors(request)))
@@ -173,19 +171,11 @@ class PosedCamerasSession(SessionWrapper):
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         """Return the tangents of the scene's parameters, and zeros for the pose parameters."""
         poses = self._state({POSES: parameters[POSES]})
-        still = {key: arrays.zeros_like(value) for key, value in poses.items()}
-        return {**{key: value for key, value in tangents.items() if key != POSES}, **still}
+        return {**self._split(tangents)[1], **{key: arrays.zeros_like(value) for key, value in poses.items()}}
 
-    def _state(self, parameters: Tree) -> Tree:
-        """Return the parameters of the inner session. Equal poses give identical arrays, so the scene need not set them again."""
-        rows = parameters[POSES]
-        known = next((tree for poses, tree in self._trees if poses is rows), None)
-        if known is None:
-            renderer = self._renderer
-            values = renderer.corrections.poses(arrays.numpy(rows))
-            known = {key: renderer.array(value) for key, value in values.items()}
-            self._trees = [*self._trees[-1:], (rows, known)]
-        return {**{key: value for key, value in parameters.items() if key != POSES}, **known}
+    def _inside(self, own: Tree) -> Tree:
+        poses = self._renderer.corrections.poses(arrays.numpy(own[POSES]))
+        return {key: self._renderer.array(value) for key, value in poses.items()}
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: PosedPaths) -> Tree:
         renderer = self._renderer

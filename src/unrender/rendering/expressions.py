@@ -27,7 +27,7 @@ from unrender.rendering.renderer import (
     Space,
     differentiated,
 )
-from unrender.rendering.wrapper import RendererWrapper, SessionWrapper, combined, layers
+from unrender.rendering.wrapper import DerivedRenderer, DerivedSession, combined, layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class _Reads(Mapping[str, Any]):
         return len(self._values)
 
 
-class ExpressionRenderer(RendererWrapper):
+class ExpressionRenderer(DerivedRenderer):
     """A renderer with additional unknowns; some parameters of the scene are functions of these.
 
     Images and gradients are as unbiased as the inner renderer's: the gradient by an unknown is that by the parameters times the derivatives
@@ -81,9 +81,7 @@ class ExpressionRenderer(RendererWrapper):
     """
 
     def __init__(self, inner: Renderer, expressions: Iterable[Expression], unknowns: Mapping[str, np.ndarray]):
-        super().__init__(inner)
         self.expressions = tuple(expressions)
-        self.max_depth = getattr(inner, "max_depth", 6)
         self.unknowns = {name: np.array(value, np.float32) for name, value in unknowns.items()}
         known = inner.parameters()
         start = {name: inner.array(value) for name, value in self.unknowns.items()}
@@ -102,13 +100,7 @@ class ExpressionRenderer(RendererWrapper):
             reason = f"the function of {key} loses its derivative; compute with the Dr.Jit tensors that it gets"
             infos[name] = replace(infos[name], differentiable=False, reason=reason)
         self._lost = frozenset(lost)
-        taken = set(self.reads)
-        self._info = {**{key: info for key, info in known.items() if key not in taken}, **infos}
-        self._targets = targets
-
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Return the unknowns, and the parameters of the scene without an expression."""
-        return self._info
+        super().__init__(inner, targets, infos)
 
     def values(self, keys: list[str]) -> Tree:
         """Return the initial values of unknowns and the values of parameters of the scene."""
@@ -121,12 +113,10 @@ class ExpressionRenderer(RendererWrapper):
         if lost := next((key for key in keys if key in differentiable & self._lost), None):
             reason = self._info[lost].reason
             raise InputError(f"parameter {lost}: it cannot be recovered by path gradients, since {reason}")
-        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
-        return _ExpressionSession(self, inner, differentiable)
+        return super().prepare(keys, space, derivatives)
 
-    def expanded(self, keys: Iterable[str]) -> list[str]:
-        """Return the parameters of the scene that depend on these."""
-        return list(dict.fromkeys(member for key in keys for member in self._targets.get(key, [key])))
+    def session(self, inner: RenderSession, differentiable: frozenset[str]) -> RenderSession:
+        return _ExpressionSession(self, inner, differentiable)
 
     def around(self, inner: Renderer) -> ExpressionRenderer:
         return ExpressionRenderer(inner, self.expressions, self.unknowns)
@@ -134,7 +124,7 @@ class ExpressionRenderer(RendererWrapper):
     def evaluated(self, values: Mapping[str, Any]) -> Tree:
         """Return the scene's parameters that depend on any of `values`; unknowns that are not among these have their initial values."""
         missing = {name: self.array(x) for name, x in self.unknowns.items() if name not in values}
-        needed = {key for name in values if name in self.unknowns for key in self._targets[name]}
+        needed = {key for name in values if name in self.unknowns for key in self.members[name]}
         return _evaluated(self.expressions, needed, _Reads({**missing, **values}), self.inner.parameters())
 
     def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -273,13 +263,12 @@ def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
     return result + dr.zeros(type(like), shape)
 
 
-class _ExpressionSession(SessionWrapper):
+class _ExpressionSession(DerivedSession):
     """Images and derivatives with respect to unknowns that parameters of the scene depend on. See `RenderSession`."""
 
     def __init__(self, renderer: ExpressionRenderer, inner: RenderSession, differentiable: frozenset[str]):
-        super().__init__(inner)
+        super().__init__(inner, renderer.unknowns)
         self._renderer, self._differentiable = renderer, differentiable
-        self._known: list[tuple[Tree, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         own, rest = self._split(parameters)
@@ -294,23 +283,11 @@ class _ExpressionSession(SessionWrapper):
                 together[key] = np.broadcast_to(x[0], x.shape)
         return self._inner.image_batch({**rest, **together}, request)
 
-    def _split(self, tree: Tree) -> tuple[Tree, Tree]:
-        unknowns = self._renderer.unknowns
-        return {k: x for k, x in tree.items() if k in unknowns}, {k: x for k, x in tree.items() if k not in unknowns}
-
-    def _state(self, parameters: Tree) -> Tree:
-        """Return the values of the scene's parameters: the same arrays for the same unknowns, which the scene need not set again."""
-        own, rest = self._split(parameters)
-        if not own:
-            return rest
-        for inputs, values in self._known:
-            if inputs.keys() == own.keys() and all(inputs[key] is x for key, x in own.items()):
-                return {**rest, **values}
+    def _inside(self, own: Tree) -> Tree:
         with dr.suspend_grad():
-            values = self._renderer.evaluated(own)
+            values = self._renderer.evaluated(own) if own else {}
         arrays.evaluate(values)
-        self._known = [*self._known[-1:], (own, values)]
-        return {**rest, **values}
+        return values
 
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         own, _ = self._split(parameters)

@@ -15,17 +15,8 @@ from unrender.core.errors import InputError, KeyedError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
-from unrender.rendering.renderer import (
-    Derivatives,
-    ParameterInfo,
-    Renderer,
-    RenderSession,
-    ReplacedMesh,
-    SampleRequest,
-    Space,
-    differentiated,
-)
-from unrender.rendering.wrapper import RendererWrapper, SessionWrapper, combined, unwrapped
+from unrender.rendering.renderer import ParameterInfo, Renderer, RenderSession, ReplacedMesh, SampleRequest
+from unrender.rendering.wrapper import DerivedRenderer, DerivedSession, combined, unwrapped
 
 _ENCODED = ("normal", "direction")  # Roles whose values represent vectors. Heights are numbers.
 
@@ -134,7 +125,7 @@ def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:
     return TiedRenderer(scene, ties) if ties else scene
 
 
-class TiedRenderer(RendererWrapper):
+class TiedRenderer(DerivedRenderer):
     """A renderer whose unknowns are ties. Images, gradients and tangents are as unbiased as the inner renderer's.
 
     Args:
@@ -142,11 +133,9 @@ class TiedRenderer(RendererWrapper):
     """
 
     def __init__(self, inner: Renderer, ties: tuple[Tie, ...]):
-        super().__init__(inner)
-        self.ties = ties
-        self.max_depth = getattr(inner, "max_depth", 6)
+        self.ties, self.factors = ties, {tie.key: tie.factors for tie in ties}
         known, owner = inner.parameters(), dict[str, str]()
-        infos = {tie.key: tie.info(known) for tie in ties}
+        super().__init__(inner, self.factors, {tie.key: tie.info(known) for tie in ties})
         for tie in ties:
             for member in tie.factors:
                 if member in owner:
@@ -156,21 +145,14 @@ class TiedRenderer(RendererWrapper):
                 raise KeyedError(
                     tie.key, f"{tie.key} is a parameter of the scene itself; expected one of keys, or another name"
                 )
-        self._info = {**{key: info for key, info in known.items() if key not in owner}, **infos}
-
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Return every parameter by key. A tie replaces its members."""
-        return self._info
 
     def values(self, keys: list[str]) -> Tree:
         """Return the scene's own values. The value of a tie is that of its first member over the member's factor."""
-        first = {tie.key: next(iter(tie.factors.items())) for tie in self.ties}
+        first = {key: next(iter(factors.items())) for key, factors in self.factors.items()}
         inner = self.inner.values([first[key][0] if key in first else key for key in keys])
         return {key: inner[first[key][0]] * (1 / first[key][1]) if key in first else inner[key] for key in keys}
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
-        differentiable = differentiated(keys, derivatives)
-        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
+    def session(self, inner: RenderSession, differentiable: frozenset[str]) -> RenderSession:
         return TiedSession(self, inner)
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
@@ -179,29 +161,21 @@ class TiedRenderer(RendererWrapper):
     def around(self, inner: Renderer) -> TiedRenderer:
         return TiedRenderer(inner, self.ties)
 
-    def expanded(self, keys: Iterable[str]) -> list[str]:
-        """Return the keys of the inner renderer's parameters that these keys set."""
-        factors = {tie.key: list(tie.factors) for tie in self.ties}
-        return [member for key in keys for member in factors.get(key, [key])]
-
     def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return {key of the inner renderer: value} for values of these keys."""
         scaled = {}
         for key, value in values.items():
-            tie = next((tie for tie in self.ties if tie.key == key), None)
-            factors = {key: 1.0} if tie is None else tie.factors
+            factors = self.factors.get(key, {key: 1.0})
             scaled |= {member: _scaled(value, factor) for member, factor in factors.items()}
         return scaled
 
 
-class TiedSession(SessionWrapper):
+class TiedSession(DerivedSession):
     """A session that renders and differentiates with respect to ties."""
 
     def __init__(self, renderer: TiedRenderer, inner: RenderSession):
-        super().__init__(inner)
+        super().__init__(inner, renderer.factors)
         self._renderer = renderer
-        self._ties = {tie.key: tie.factors for tie in renderer.ties}
-        self._known: list[tuple[Array, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         return self._inner.image_batch(self._renderer.scene_values(parameters), request)
@@ -209,25 +183,14 @@ class TiedSession(SessionWrapper):
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         return self._renderer.scene_values(tangents)
 
-    def _state(self, parameters: Tree) -> Tree:
-        """Return the values of the scene's parameters. An identical value gives identical arrays, so the scene need not set them again."""
-        state: Tree = {}
-        for key, value in parameters.items():
-            if key not in self._ties:
-                state[key] = value
-                continue
-            members = next((tree for known, tree in self._known if known is value), None)
-            if members is None:
-                members = {member: _scaled(value, factor) for member, factor in self._ties[key].items()}
-                self._known = [*self._known[1 - 2 * len(self._ties) :], (value, members)]
-            state |= members
-        return state
+    def _inside(self, own: Tree) -> Tree:
+        return self._renderer.scene_values(own)
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
         """Return the gradient by the unknowns. The gradient by a tie is the sum of its members' gradients times their factors."""
         gradient: Tree = {}
         for key in parameters:
-            factors = self._ties.get(key, {key: 1.0})
+            factors = self._renderer.factors.get(key, {key: 1.0})
             parts = [inner_gradient[member] * factor for member, factor in factors.items() if member in inner_gradient]
             if parts:
                 gradient[key] = sum(parts[1:], parts[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from unrender.rendering.renderer import (
     Space,
     WithCameras,
     counted_vertices,
+    differentiated,
     drawing_emitters,
     with_differential_bsdf,
 )
@@ -158,6 +159,64 @@ class SessionWrapper:
         state, inner_tangents = self._state(parameters), self._tangents(parameters, tangents)
         inner = drawing_emitters(self._inner)
         return inner.emitter_moments(state, self._paths(paths), inner_tangents, self._weights(weights), noise)
+
+
+class DerivedRenderer(RendererWrapper):
+    """A renderer with unknowns that set parameters of the inner renderer in their place.
+
+    Args:
+        members: {unknown: keys of the inner renderer's parameters that it sets}.
+        infos: {unknown: its description}.
+    """
+
+    def __init__(self, inner: Renderer, members: Mapping[str, Collection[str]], infos: Mapping[str, ParameterInfo]):
+        super().__init__(inner)
+        self.max_depth, self.members = getattr(inner, "max_depth", 6), members
+        hidden = {member for keys in members.values() for member in keys}
+        self._info = {**{key: info for key, info in inner.parameters().items() if key not in hidden}, **infos}
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Return the unknowns, and the inner renderer's parameters that no unknown sets."""
+        return self._info
+
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
+        differentiable = differentiated(keys, derivatives)
+        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
+        return self.session(inner, differentiable)
+
+    def session(self, inner: RenderSession, differentiable: frozenset[str]) -> RenderSession:
+        """Return the session around one of the inner renderer's, with derivatives by the keys `differentiable`."""
+        raise NotImplementedError
+
+    def expanded(self, keys: Iterable[str]) -> list[str]:
+        """Return the keys of the inner renderer's parameters that these keys set."""
+        return list(dict.fromkeys(member for key in keys for member in self.members.get(key, [key])))
+
+
+class DerivedSession(SessionWrapper):
+    """A session whose parameters `own` set parameters of the inner session, see `_inside`."""
+
+    def __init__(self, inner: RenderSession, own: Collection[str]):
+        super().__init__(inner)
+        self._own, self._known = frozenset(own), list[tuple[Tree, Tree]]()
+
+    def _inside(self, own: Tree) -> Tree:
+        """Return the parameters of the inner session that these values set."""
+        raise NotImplementedError
+
+    def _split(self, tree: Tree) -> tuple[Tree, Tree]:
+        return {k: x for k, x in tree.items() if k in self._own}, {k: x for k, x in tree.items() if k not in self._own}
+
+    def _state(self, parameters: Tree) -> Tree:
+        """Return the inner session's parameters: the same arrays for the same values, so the scene need not set them again."""
+        own, rest = self._split(parameters)
+        known = next(
+            (tree for of, tree in self._known if of.keys() == own.keys() and all(of[k] is own[k] for k in of)), None
+        )
+        if known is None:
+            known = self._inside(own)
+            self._known = [*self._known[-1:], (own, known)]
+        return {**rest, **known}
 
 
 def combined(infos: Sequence[ParameterInfo]) -> dict[str, Any]:

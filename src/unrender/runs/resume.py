@@ -39,9 +39,7 @@ from unrender.scene.fingerprint import differences, fingerprint, shortened
 from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
-_WARNINGS = "warnings"
-_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, _HIDDEN = "candidate", "ahead", "numbers", "pictures", "hidden"
-_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, _HIDDEN, "few_steps", "other_start")
+_OPTIONAL = ("candidate", "ahead", "numbers", "pictures", "hidden", "few_steps", "other_start")
 """Parts of a snapshot that only some runs have."""
 
 
@@ -228,12 +226,15 @@ class _Restore(Callback):
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         source = self.source
-        saved = (
-            fresh if source.checkpoint is None else self._unpack(source.checkpoint, fresh, warm, run.problem.shapes())
-        )
+        try:
+            saved = (
+                fresh if source.checkpoint is None else _unpack(source.checkpoint, fresh, warm, run.problem.shapes())
+            )
+        except InputError as error:
+            raise _UnusableCheckpoint(str(error)) from error
         warnings = [f"skipped: {line}" for line in source.passed_over]
         warnings += [f"resumed with force although changed since: {self.changes}"] if self.changes else []
-        saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
+        saved["warnings"] = [*saved["warnings"], *warnings]
         run.history[:] = (record for record in source.records if record["step"] < saved["step"])
         run.resumed = [*self.record.resumed, saved["step"]]
         run.warmup_seconds += self.record.warmup_seconds
@@ -241,14 +242,6 @@ class _Restore(Callback):
         if self.record.stopped == NON_FINITE:  # resuming a stopped run means another attempt
             run.state.skipped_in_a_row = 0
         self.writer.resume(run.history, run.result())
-
-    def _unpack(
-        self, source: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], shapes: Mapping[str, tuple[int, ...]]
-    ) -> dict[str, Any]:
-        try:
-            return _unpack(source, fresh, warm, shapes)
-        except InputError as error:
-            raise _UnusableCheckpoint(str(error)) from error
 
 
 def _unpack(
@@ -261,11 +254,11 @@ def _unpack(
         n for n in fresh if n not in _OPTIONAL
     ]:
         raise InputError(f"{where}: expected the state of a run, got {repr(saved)[:60]}")
-    warnings = saved[_WARNINGS]
+    warnings = saved["warnings"]
     if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
-        raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
+        raise InputError(f"{where}: warnings: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
-        if name not in (_WARNINGS, *_OPTIONAL):
+        if name not in ("warnings", *_OPTIONAL):
             try:
                 check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
             except InputError as error:
@@ -273,8 +266,8 @@ def _unpack(
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
             raise InputError(f"{where}: {name}: expected a number of at least 0, got {saved[name]}")
-    if saved.get(_AHEAD, 0) != _ahead(source):
-        raise InputError(f"{where}: {_AHEAD}: expected a number of steps, got {saved[_AHEAD]!r:.60}")
+    if saved.get("ahead", 0) != _ahead(source):
+        raise InputError(f"{where}: ahead: expected a number of steps, got {saved['ahead']!r:.60}")
     if saved["step"] != source.manifest.step:
         raise InputError(f"{where}: step: expected {source.manifest.step}, got {saved['step']}")
     expected = trees.shapes(fresh["parameters"])
@@ -283,15 +276,15 @@ def _unpack(
     for name in ("parameters", "optimizer"):
         if part := not_finite(saved[name], name):
             raise InputError(f"{where}: {part}: not finite")
-    if _CANDIDATE in saved:
-        _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
-    if _NUMBERS in saved:
-        NumberTrace.check(saved[_NUMBERS], f"{where}: {_NUMBERS}")
-    hidden = saved.get(_HIDDEN, {})
+    if "candidate" in saved:
+        _check_candidate(saved["candidate"], full_shapes, f"{where}: candidate")
+    if "numbers" in saved:
+        NumberTrace.check(saved["numbers"], f"{where}: numbers")
+    hidden = saved.get("hidden", {})
     if not isinstance(hidden, dict) or not all(key in full_shapes and type(n) is int for key, n in hidden.items()):
-        raise InputError(f"{where}: {_HIDDEN}: expected a number of steps for meshes, got {repr(hidden)[:60]}")
-    if _PICTURES in saved:
-        check_stored(saved[_PICTURES], f"{where}: {_PICTURES}")
+        raise InputError(f"{where}: hidden: expected a number of steps for meshes, got {repr(hidden)[:60]}")
+    if "pictures" in saved:
+        check_stored(saved["pictures"], f"{where}: pictures")
     return saved
 
 
@@ -299,7 +292,7 @@ def _ahead(source: Checkpoint) -> int:
     """Return how many steps resolutions are ahead of their schedule, before the state is restored, whose shapes depend on it."""
     match source.packed.skeleton:
         case {"dict": list(pairs)}:
-            number = next((pair[1] for pair in pairs if isinstance(pair, list) and pair[:1] == [_AHEAD]), 0)
+            number = next((pair[1] for pair in pairs if isinstance(pair, list) and pair[:1] == ["ahead"]), 0)
             return number if type(number) is int and 0 <= number < NEVER else 0
     return 0
 

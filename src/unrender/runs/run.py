@@ -176,15 +176,10 @@ class Run:
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
-        state, noise = self.state, self.state.noise
-        candidate = None if state.candidate is None else vars(state.candidate)
-        parts = {"candidate": candidate, "ahead": self.ahead or None}
-        parts |= {"few_steps": self.few_steps or None, "other_start": state.other_start or None}
-        parts |= {
-            "numbers": state.numbers.snapshot(),
-            "pictures": state.pictures or None,
-            "hidden": dict(state.hidden) or None,
-        }
+        state, candidate = self.state, self.state.candidate
+        parts = {"candidate": candidate and vars(candidate), "ahead": self.ahead, "few_steps": self.few_steps}
+        parts |= {"other_start": state.other_start, "numbers": state.numbers.snapshot()}
+        parts |= {"pictures": state.pictures, "hidden": dict(state.hidden)}
         return {
             "parameters": self.parameters,
             "step": self.step,
@@ -193,12 +188,12 @@ class Run:
             "warnings": list(self.warnings),
             "estimator": self.problem.executor.collect(state.estimator),
             "optimizer": state.optimizer,
-            "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
+            "noise": dict(vars(state.noise)),
             "zero_gradient": dict(state.zero_gradient),
             "samples": state.samples,
             "skipped_in_a_row": state.skipped_in_a_row,
             "next_error": state.next_error,
-        } | {name: part for name, part in parts.items() if part is not None}
+        } | {name: part for name, part in parts.items() if part}
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Restore a snapshot, which has been checked to be one of this run's."""

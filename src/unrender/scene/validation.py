@@ -121,7 +121,8 @@ def check_parameter(
         mesh = None if info.moving_mesh is None else info.moving_mesh()
         regularizer = check_regularizer(parameter.regularizer, mesh)
     with checking("prior"):
-        known_prior = None if parameter.prior is None else _bound_prior(parameter.prior, info, initial, bounds)
+        prior = None if parameter.prior is None else tables.options(Prior, parameter.prior, "{ smoothness = 0.05 }")
+        known_prior = prior and prior.on(initial, info.conversion.repeated, mesh_topology(info), info.welded, bounds)
     with checking("remeshing"):
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
         _check_attributes(remeshing, key, known)
@@ -147,12 +148,6 @@ def check_parameter(
         prior=known_prior,
         remeshing=remeshing,
         notices=tuple(notices),
-    )
-
-
-def _bound_prior(prior: Any, info: ParameterInfo, initial: np.ndarray, bounds: Bounds) -> Prior:
-    return tables.options(Prior, prior, "{ smoothness = 0.05 }").on(
-        initial, info.conversion.repeated, mesh_topology(info), info.welded, bounds
     )
 
 

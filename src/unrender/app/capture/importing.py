@@ -319,7 +319,8 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
         meshes.check_installed()
     if unwrapped and (own_mesh is None or own_mesh.uv is None):
         meshes.check_atlas_installed()
-    if own_mesh is None and not _has_masks(capture):
+    maskable = (".exr", ".png", ".tif", ".tiff", ".webp")
+    if own_mesh is None and all(p.mask is None and p.file.suffix.lower() not in maskable for p in capture.photographs):
         raise InputError(f"{folder}: {_NO_SHAPE}")
     views, notices = _views(capture, options)
     masked = all(views.masked)
@@ -343,13 +344,6 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     if "response" in options.chosen(DEFAULT) and not turned:
         notices.append(STILL_LIGHT)
     return _Read(capture, views, mesh, silhouettes, overlaps, turned, (*capture.notices, *notices), refusal)
-
-
-def _has_masks(capture: Capture) -> bool:
-    return any(
-        p.mask is not None or p.file.suffix.lower() in (".exr", ".png", ".tif", ".tiff", ".webp")
-        for p in capture.photographs
-    )
 
 
 def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:

@@ -137,7 +137,8 @@ class StrengthFit:
         fit = self
         if self.count == 0:
             strength = preconditioner.strength_of(arrays.shape(pair.gradient))
-            fit = replace(self, sums=np.zeros((_candidates(strength), 2)))
+            candidates = 1 + max(0, math.ceil(math.log(max(strength, _WEAKEST) / _WEAKEST, _FACTOR)))
+            fit = replace(self, sums=np.zeros((candidates, 2)))
         smooth = preconditioner.scaled(self.share)
         sums = fit.sums + pair.descents(smooth, fit._shares / self.share).T
         return replace(fit, share=_share(sums), count=self.count + 1, sums=sums)
@@ -208,10 +209,6 @@ class _Pair:
         if self.second is None:
             return smooth.descents(self.previous, self.gradient, shares)
         return smooth.descents_of_summaries(arrays.shape(self.gradient), self.first, self.second, shares)
-
-
-def _candidates(strength: float) -> int:
-    return 1 + max(0, math.ceil(math.log(max(strength, _WEAKEST) / _WEAKEST, _FACTOR)))
 
 
 def _confirmed(rows: np.ndarray, candidate: int) -> tuple[float, float]:

@@ -158,20 +158,12 @@ def _check_array(array: Any, patterns: list[Any], where: str) -> None:
 
 def not_finite(state: Any, where: str = "state") -> str:
     """Return the path of the first number in a state that is not finite: "state.second_moment['wall']"; "" if there is none."""
-    if dataclasses.is_dataclass(state) and not isinstance(state, type):
-        parts = ((getattr(state, each.name), f"{where}.{each.name}") for each in dataclasses.fields(state))
-    elif isinstance(state, Mapping):
-        parts = ((part, f"{where}[{key!r}]") for key, part in state.items())
-    elif isinstance(state, (tuple, list)):
-        parts = ((part, f"{where}[{index}]") for index, part in enumerate(state))
-    elif isinstance(state, _FLOATS):
+    if isinstance(state, _FLOATS):
         return "" if math.isfinite(state) else where
-    elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
+    if isinstance(state, np.ndarray) or arrays.is_drjit(state):
         host = arrays.numpy(state)
         return where if host.dtype.kind == "f" and not np.isfinite(host).all() else ""
-    else:
-        return ""
-    return next((place for part, name in parts if (place := not_finite(part, name))), "")
+    return next((place for name, part in _children(state) if (place := not_finite(part, f"{where}{name}"))), "")
 
 
 @dataclass
@@ -289,15 +281,17 @@ def _path(kind: type) -> str:
 def parts(state: Any) -> Iterator[Any]:
     """Yield a state and all its parts: fields of dataclasses, values of mappings, and elements of lists and tuples."""
     yield state
-    below: Iterable[Any] = ()
-    if dataclasses.is_dataclass(state) and not isinstance(state, type):
-        below = (getattr(state, each.name) for each in dataclasses.fields(state))
-    elif isinstance(state, Mapping):
-        below = state.values()
-    elif isinstance(state, (tuple, list)):
-        below = state
-    for part in below:
+    for _, part in _children(state):
         yield from parts(part)
+
+
+def _children(state: Any) -> Iterable[tuple[str, Any]]:
+    """Return the direct parts of a state by their names, such as ".steps", "['wall']" and "[2]"; none for arrays and numbers."""
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        return ((f".{each.name}", getattr(state, each.name)) for each in dataclasses.fields(state))
+    if isinstance(state, Mapping):
+        return ((f"[{key!r}]", part) for key, part in state.items())
+    return ((f"[{index}]", part) for index, part in enumerate(state)) if isinstance(state, (tuple, list)) else ()
 
 
 def _is_state(kind: Any) -> bool:
