@@ -106,7 +106,6 @@ def check_parameter(
         rate = parameter.learning_rate
         if rate is not None and (not is_number(rate) or rate <= 0):
             raise InputError(f"expected a number above 0, got {rate!r}")
-        rate = None if rate is None else float(rate)
     parameterisation, transform = None, None
     with checking("preconditioner"):
         preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
@@ -138,7 +137,7 @@ def check_parameter(
         initial=initial,
         bounds=bounds,
         measure=ErrorMeasure(info.role, info.conversion.repeated),
-        learning_rate=rate,
+        learning_rate=rate and float(rate),
         preconditioner=preconditioner,
         parameterisation=parameterisation,
         transform=transform,
