@@ -615,6 +615,22 @@ def test_a_few_bright_pixels_are_no_saturated_reference(clipped: bool) -> None:
     assert cause.endswith("were saturated at 0.6 (set the loss Censored)") if clipped else "saturated" not in cause
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.2])
+def test_noise_of_one_bright_pixel_of_a_reference_is_no_shift(shift: float) -> None:
+    """A lamp's edge pixel decided the fit alone, so the residual there hid its noise, and right references of a chalice were blamed."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.2, 0.6, (WIDE, WIDE, 3))
+    image[20, 20] = 25.0
+    images = image.reshape(1, -1, 3) + 1e-3 * rng.standard_normal((4, WIDE * WIDE, 3))
+    reference = image + shift * np.gradient(image, axis=1)
+    reference[20, 21] += 0.4  # noise of the pixel beside it, of which a lamp covers a part
+    weights = np.ones((WIDE, WIDE))
+    weights[19:22, 19:21] = weights[[19, 21], 21] = 0.0
+    residuals = Residuals(images - reference.reshape(-1, 3), reference.reshape(-1, 3), weights.ravel(), [(WIDE, WIDE)])
+    _, shared, sure = final_checks._as_if(residuals, images[1::2].mean(axis=0))
+    assert (shared > 0.0 and sure) is bool(shift)
+
+
 @pytest.mark.parametrize("shift", [0, 1])
 @pytest.mark.parametrize("progress", [0.2, 0.7, 1.0])
 def test_a_dark_background_tells_of_a_misplaced_object(shift: int, progress: float) -> None:

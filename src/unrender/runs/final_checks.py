@@ -19,6 +19,7 @@ from unrender.runs.reference_distortions import AS_IF, distortions
 from unrender.runs.result import Result
 from unrender.runs.verification import PRIOR, STEPS, Misfit, as_few_samples, compares, misfit, without_prior
 from unrender.scene.problem import Problem
+from unrender.statistics import scores
 from unrender.statistics.paired_losses import slices_of_images
 
 _ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
@@ -325,9 +326,11 @@ def _as_if(residuals: Residuals, images: np.ndarray) -> tuple[str, float, bool]:
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
             amounts = inverse @ (columns.T @ wanted)
-            scores = columns * (wanted - columns @ amounts)[:, None]
-            errors = np.sqrt(np.diagonal(inverse @ (scores.T @ scores) @ inverse))
-            fit = columns @ amounts
+            fit, pixels = columns @ amounts, columns.T.reshape(len(changes), -1, 3)
+            # A bright pixel may decide the fit alone, and its residual is then smaller than the noise of its reference.
+            left = scores.without_own_pixel((wanted - fit).reshape(-1, 3), pixels, pixels, inverse)
+            products = columns * np.ravel(left)[:, None]
+            errors = np.sqrt(np.diagonal(inverse @ (products.T @ products) @ inverse))
             squares, name = np.square(fit), words(amounts)
             explained[name] = float(wanted @ again - (wanted - fit) @ (again - fit))
             fitted = math.sqrt(float(squares.sum()) / total)

@@ -102,7 +102,9 @@ def distortion_of_fit(
             product += 0.5 * sum(np.tensordot(both[half], after[1 - half, part], axes=2) for half in (0, 1))
             rest[:, part] += own
             amounts = np.linalg.solve(matrix, product)
-            left = mean - np.tensordot(amounts, rest, axes=1)
+            left = scores.without_own_pixel(
+                mean - np.tensordot(amounts, rest, axes=1), rest, rest, np.linalg.inv(matrix)
+            )
             middle = np.zeros_like(matrix)
             for change, residual in zip(numbers.by_view(rest), numbers.by_view(left[None]), strict=True):
                 score = (change * residual).sum(axis=3)
