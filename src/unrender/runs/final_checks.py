@@ -322,7 +322,8 @@ def _as_if(residuals: Residuals, images: np.ndarray) -> tuple[str, float, bool]:
         wanted, again = (np.ravel(half[part] * root) for half in residuals.halves)
         noise, best, explained = np.square(wanted - again) / 2.0, "", {}
         image, reference = (x.reshape(*sizes[view], 3) for x in (images[part], references[part]))
-        for index, (words, changes) in enumerate(distortions(image, reference).items()):
+        most = [*distortions(image, reference).items()][:-1]  # distortion by a lens looks like another field of view
+        for index, (words, changes) in enumerate(most):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
             amounts = inverse @ (columns.T @ wanted)

@@ -19,7 +19,7 @@ from unrender.display import formatting
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
-from unrender.runs.reference_distortions import distortion_of_fit
+from unrender.runs.reference_distortions import distortions_of_fit
 from unrender.runs.verification import SMOOTH, compares, unexplained_share
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -214,8 +214,8 @@ class _Fit:
         blind: largest changes of the numbers along the other hidden directions, of whose slopes this check knows upper limits, (n,).
         better: standard errors by which the picture is better than with the start's numbers.
         beyond: distance of the solution beyond a bound of the number, (n,); 0 where noise may explain it.
-        distortion: what a reference looks like, see `distortion_of_fit`; "" for nothing.
-        moves, unexplained: change of the numbers if it were so, (n,); see `unexplained_share`.
+        distortions: what references look like, and the changes of the numbers if they were so, (n,), see `distortions_of_fit`.
+        unexplained: see `unexplained_share`.
     """
 
     covariance: np.ndarray
@@ -226,8 +226,7 @@ class _Fit:
     blind: np.ndarray | float = 0.0
     better: float = math.inf
     beyond: np.ndarray = field(default_factory=lambda: np.zeros(1))
-    distortion: str = ""
-    moves: np.ndarray | float = 0.0
+    distortions: Sequence[tuple[str, np.ndarray]] = ()
     unexplained: float = 0.0
 
     @classmethod
@@ -281,10 +280,11 @@ class _Fit:
         better = math.inf if before is None else _better(residuals, before)
         seen = np.where(hidden[:, None, None], 0.0, slopes)
         seen_inverse = np.where(hidden, 0.0, inverse)
-        distortion, moves = distortion_of_fit(numbers, residuals, after, seen, seen_inverse)
+        found = distortions_of_fit(numbers, residuals, after, seen, seen_inverse)
+        distortions = [(words, changes[:n] @ moves) for words, moves in found]
         return cls(
             total, error, own, step[:n], unseen[:, hidden], blind, better, beyond,
-            distortion, changes[:n] @ moves, unexplained_share(numbers, seen, seen_inverse),
+            distortions, unexplained_share(numbers, seen, seen_inverse),
         )  # fmt: skip
 
 
@@ -361,17 +361,14 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
 def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, refuted: bool) -> str:
     """Return a line about a distortion of a reference that would move numbers by several standard errors (n,), or about a difference that
     no numbers explain; "" for none. Where numbers have not settled, or are `refuted`, their pictures may differ as if so."""
-    moves = np.broadcast_to(fit.moves, of_step.shape)
-    far = {
-        key: moves[of] for key, of in numbers.places().items() if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()
-    }
-    moved = [f"{key} by {_numbers(by)}" for key, by in far.items()]
     line = f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references "
     # What a step leaves of the pictures may be its curvature, however small a part of the number's range it is.
     unsettled = refuted or bool((np.abs(fit.step) > _STEP_ERRORS * of_step).any())
     first = "give more steps or another start, then " * unsettled
-    if moved:
-        return f"{line}{fit.distortion}, which would move {listed(moved)}; {first}check the references and the camera"
+    for words, moves in fit.distortions:
+        far = [k for k, of in numbers.places().items() if (np.abs(moves[of]) > _DISTORTED * of_step[of]).any()]
+        if moved := [f"{key} by {_numbers(moves[numbers.places()[key]])}" for key in far]:
+            return f"{line}{words}, which would move {listed(moved)}; {first}check the references and the camera"
     line += f"by {100.0 * fit.unexplained:.2g} % {SMOOTH}; {first}check what is not among "
     return f"{line}the unknowns, such as lights, the camera and the tone curve" if fit.unexplained else ""
 

@@ -253,7 +253,7 @@ def misfit_of_views(
 
 def unexplained_share(numbers: Numbers, slopes: np.ndarray, inverse: np.ndarray) -> float:
     """Return the size of what a least-squares fit leaves of the final pictures' residual, relative to the references; 0 where noise or
-    other unknowns than the numbers may explain it. For the arguments, see `distortion_of_fit`."""
+    other unknowns than the numbers may explain it. For the arguments, see `distortions_of_fit`."""
     if not numbers.ends or len(numbers.keys) < len(numbers.problem.unknowns):
         return 0.0
     references = numbers.references()
