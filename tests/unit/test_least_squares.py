@@ -513,14 +513,14 @@ def test_numbers_have_no_standard_errors_where_a_distortion_of_the_reference_wou
 
 
 @pytest.mark.parametrize("distort", [False, True])
-@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("noise", [0.02, 0.05])
 def test_a_field_of_view_has_no_standard_error_beside_a_lens(distort: bool, noise: float):
-    """Noise of few samples hid what a lens of 5 % did to the picture, while the field of view was 15 standard errors off."""
+    """Noise of the reference hid what a lens of 5 % did to the picture, while the field of view was 15 standard errors off."""
     y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
     matrix = (_seen(0.0, 1.01 * x, 1.01 * y) - _seen(0.0, 0.99 * x, 0.99 * y)).reshape(-1, 1) / 0.02
     offset, random = _seen(0.0, x, y), np.random.default_rng(3)
-    renderer = AnalyticRenderer({"a": np.zeros(1)}, matrix, offset=offset, noise=0.0, grain=noise, shape=(SIDE, SIDE))
-    reference = _seen(0.0, *(_lens(x, y) if distort else (x, y))) + random.normal(0.0, 0.02, offset.shape)
+    renderer = AnalyticRenderer({"a": np.zeros(1)}, matrix, offset=offset, noise=0.0, grain=0.2, shape=(SIDE, SIDE))
+    reference = _seen(0.0, *(_lens(x, y) if distort else (x, y))) + random.normal(0.0, noise, offset.shape)
     made = ur.Problem(renderer, [ur.Parameter("a", initial=[0.5])], [ur.View(reference.astype(np.float32))])
     end = np.linalg.lstsq(matrix, (reference - offset).ravel(), rcond=None)[0]
     found = check_numbers(made, {"a": end.astype(np.float32)}, made.initial_values(), FAR)
