@@ -8,6 +8,7 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from unrender.runs.resume import load_run, resume_run
 from unrender.runs.run import Run
 from unrender.runs.watches import InfluenceWatch
 from unrender.scene import serialization
+from unrender.scene.executor import LOCAL
 
 TRUTH = {"gain": np.full(2, 0.5)}
 
@@ -74,16 +76,15 @@ def test_a_budget_may_cover_more_than_the_steps(
 ) -> None:
     """Steps alone have all 20 seconds. Otherwise 3 are for the final pictures, and the steps have half of the budget, as long as all ends
     within 5 seconds of it, or 15 if kernels were compiled. Each step takes a second, which the next one sees."""
-    now, warm_up, kernels = [100.0], loop.warm_up, [0]
+    now, warm_up = [100.0], loop.warm_up
 
     def compiled(run: Run) -> Any:
         now[0] += warming
-        kernels[0] += compiles
-        return warm_up(run)
+        done, run.compiled = warm_up(run), compiles
+        return done
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
-    monkeypatch.setattr(budget.cache, "kernels_changed", lambda: kernels[0])
 
     class Seconds(Callback):
         def on_step(self, run: Any, record: Any) -> None:
@@ -147,6 +148,24 @@ def test_advice_on_few_steps_suits_the_run() -> None:
     assert not budget.few_steps(4.0, 20, spp=16)
     assert "; use at least 13 seconds or a smaller picture" in budget.few_steps(4.0, 3, enough=12.1)
     assert "about 3 steps after 2 s of loading and compiling; use" in budget.few_steps(4.0, 3, before=1.8)
+    # The next run has the kernels: with them the same seconds suffice, and more than these would not be the least.
+    again = budget.few_steps(12.0, 3, enough=9.0, before=8.0, compiled=True)
+    assert again.endswith("; run it again, with the kernels that are now compiled or a smaller picture (resolution)")
+    assert "; use at least 14 seconds" in budget.few_steps(12.0, 3, enough=13.5, before=8.0, compiled=True)
+
+
+@pytest.mark.parametrize(("workers", "own", "compiled"), [(False, 0, False), (False, 1, True), (True, 0, True)])
+def test_kernels_of_other_processes_do_not_count_unless_workers_trace_paths(
+    workers: bool, own: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run whose kernels were known, beside one that compiled, was allowed to end 15 s late."""
+    monkeypatch.setattr(loop.cache, "kernels_changed", itertools.count().__next__)
+    monkeypatch.setattr(loop.dr.detail, "launch_stats", ((0, 0, own * n) for n in itertools.count()).__next__)
+    remote: Any = SimpleNamespace(**{name: getattr(LOCAL, name) for name in dir(LOCAL) if name[0] != "_"})
+    made = problem().with_parts(executor=remote if workers else LOCAL)
+    run = loop.prepare(Plan(made, ur.PathGradient(), ur.optimizers.Adam(0.01)), 1, None, 0)
+    loop.warm_up(run)
+    assert run.compiled is compiled
 
 
 @pytest.mark.parametrize(
@@ -303,6 +322,8 @@ def test_the_end_of_the_steps_leaves_time_for_the_final_pictures(
     assert (run.last_step or 0.0) - time.perf_counter() == pytest.approx(left, abs=0.1)
     run.step, run.clock = 3, 0.15 * left  # 20 steps fill this time, and it advised 10 seconds of 12 on a busy machine
     run.deadline = time.perf_counter() + seconds - run.clock
+    assert budget._enough(run, 20) == pytest.approx(seconds, rel=0.01)
+    run.before, run.tracing, run.compiled = 5.0, 5.0, True  # seconds that another run does not need
     assert budget._enough(run, 20) == pytest.approx(seconds, rel=0.01)
 
 

@@ -85,7 +85,7 @@ def use_for_kernels() -> None:
 
 
 def kernels_changed() -> int | None:
-    """Return the time in nanoseconds at which Dr.Jit last added or removed a kernel in its cache folder; None if unknown."""
+    """Return the time in nanoseconds at which a process last added or removed a kernel in Dr.Jit's cache folder; None if unknown."""
     place = os.environ.get(_DRJIT_VARIABLE) or os.path.expanduser("~/.drjit")
     try:
         return os.stat(place).st_mtime_ns

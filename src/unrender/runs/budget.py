@@ -5,11 +5,10 @@ from __future__ import annotations
 import glob
 import math
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unrender.backend import cache
 from unrender.core import checks, timing
 from unrender.core.errors import InputError
 from unrender.core.text import in_words
@@ -57,10 +56,6 @@ class Budget(Callback):
 
     def __init__(self) -> None:
         self._least = self._looked = -math.inf
-        self._kernels = cache.kernels_changed()
-
-    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        run.compiled = cache.kernels_changed() != self._kernels
 
     def on_start(self, run: Run) -> None:
         if run.deadline is not None:
@@ -176,7 +171,7 @@ def _warn_of_few_steps(run: Run) -> None:
     spp, steps = getattr(run.estimator, "spp", None), max(expected, run.step)
     ways = spp if isinstance(spp, int) else None, _suits_mini_batches(run), _enough(run, needed)
     ways = (None, False, None) if run.replanned else ways  # another budget or option has other steps
-    line = few_steps(run.seconds, steps, run.steps, *ways, needed, run.before)
+    line = few_steps(run.seconds, steps, run.steps, *ways, needed, run.before, run.compiled)
     run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
     run.few_steps = line
 
@@ -193,12 +188,12 @@ def _suits_mini_batches(run: Run) -> bool:
 
 
 def _enough(run: Run, needed: int) -> float:
-    """Return the seconds that `needed` steps need, with everything before and after the steps if the budget covers it."""
+    """Return the seconds that `needed` steps of another run need, with everything before and after them if the budget covers it."""
     steps = needed * run.clock / run.step
     if run.deadline is None or run.seconds is None:
         return steps
-    busy = min(slowdown(), MOST_SLOWDOWN)
-    return min((run.before + steps + busy * _END_SECONDS) / (1.0 - busy * _END_SHARE), 2.0 * (run.before + steps))
+    busy, before = min(slowdown(), MOST_SLOWDOWN), run.before - run.tracing * run.compiled  # it compiles no kernels
+    return min((before + steps + busy * _END_SECONDS) / (1.0 - busy * _END_SHARE), 2.0 * (before + steps))
 
 
 def few_steps(
@@ -210,6 +205,7 @@ def few_steps(
     enough: float | None = None,
     needed: int = _FEW_STEPS,
     before: float = 0.0,
+    compiled: bool = False,
 ) -> str:
     """Return a line with advice if a budget allows fewer than `needed` steps and fewer than `most`; else "".
 
@@ -221,10 +217,13 @@ def few_steps(
         enough: seconds that the needed steps need; None if unknown.
         needed: number of steps; Gauss-Newton steps of all unknowns need fewer.
         before: seconds of the budget before the first step.
+        compiled: whether kernels were compiled that another run has, whose seconds `enough` are.
     """
     if steps >= min(needed, most or needed):
         return ""
     ways = ["use more seconds" if enough is None else f"use at least {max(math.ceil(enough), 1)} seconds"]
+    if compiled and enough is not None and enough <= seconds:
+        ways = ["run it again, with the kernels that are now compiled"]
     if spp is not None and spp > _LEAST_SPP:
         ways.append(f"fewer samples (--set spp={max(spp // 4, _LEAST_SPP)})")
     ways.append("a smaller picture (resolution)")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from unrender.backend import cache
@@ -33,6 +34,7 @@ from unrender.runs.metadata import described, first_values
 from unrender.runs.result import Result
 from unrender.runs.run import GradientNoise, Run, RunState, interruptible
 from unrender.runs.watches import remarks
+from unrender.scene.executor import LocalExecutor
 from unrender.scene.surfaces import guarded
 
 WARM_UP_STEPS = 2  # number of discarded steps before the first one
@@ -132,7 +134,7 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
     It is one step if that takes much of a budget in seconds without compiling, or half of what is left where the plan has cheaper steps,
     unless a resumed run compares its state with the snapshot.
     """
-    started, kernels, whole = time.perf_counter(), cache.kernels_changed(), run
+    started, kernels, whole = time.perf_counter(), _compiled_kernels(run), run
     run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
     state = run.state
     trials: list[tuple[float, int]] = []
@@ -154,11 +156,18 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         is_long = run.deadline is not None and whole.trial[0] > _LONG_STEP * (run.seconds or math.inf)
         # A plan with cheaper steps looks at a step without tracing, if that leaves half of the time.
         is_long &= run.plan.cheaper is None or whole.trial[0] > 0.5 * run.time_left()
-        if is_long and kernels == cache.kernels_changed() and run.resumed is None:
+        if is_long and kernels == _compiled_kernels(run) and run.resumed is None:
             break
     (first, paths), (last, own) = trials[0], trials[-1]  # the first may trace more paths
     whole.tracing = max(first - last * paths / max(own, 1), 0.0) if len(trials) > 1 else first
+    whole.compiled |= kernels != _compiled_kernels(run)
     return time.perf_counter() - started, run.snapshot()
+
+
+def _compiled_kernels(run: Run) -> tuple[int, int | None]:
+    """Return a value that changes when a kernel is compiled: in this process, or if workers trace paths, in any with this cache."""
+    local = isinstance(run.problem.executor, LocalExecutor)
+    return dr.detail.launch_stats()[2], None if local else cache.kernels_changed()
 
 
 def _step(run: Run) -> dict[str, Any]:

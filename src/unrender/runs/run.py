@@ -58,7 +58,7 @@ class Run:
         trial: seconds and samples of the last step of the warm-up.
         replanned: whether the plan has been replaced by one with shorter steps, see `budget.shorter_steps`.
         tracing: seconds by which the first step of the warm-up took longer than the last one with as many paths; all of it for one step.
-        compiled: whether the warm-up has added kernels to the cache.
+        compiled: whether kernels were compiled in the warm-up.
         tested: whether the budget has time for tests at the end, whose kernels the warm-up has then compiled.
     """
 

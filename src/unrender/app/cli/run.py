@@ -12,6 +12,7 @@ import typer
 
 from unrender.app.cli import arguments, stages
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
+from unrender.backend.variant import VARIANTS
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 def variant_again(typed: str | None, record: RunRecord) -> str:
     """Return the Mitsuba variant of the workers of a resumed run: the typed one, else the run's, else `auto`."""
-    from unrender.backend.variant import VARIANTS
-
     before = record.problem.description.get("workers")
     return typed or (before if before in VARIANTS else "auto")
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from unrender.app.cli import arguments
+from unrender.app.cli.signals import DOUBTFUL, FAILED
 from unrender.core import phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
@@ -177,7 +178,6 @@ def _run_silently(
 ) -> SweepRecord:
     import io
 
-    from unrender.app.cli.signals import DOUBTFUL, FAILED
     from unrender.app.cli.sweep_driver import Session
     from unrender.app.sweeps.record import read_sweep
 
