@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import documents
-import matplotlib
 import pytest
 from documents import ROOT, Runner, blocks, previous_pages
 
@@ -99,6 +98,8 @@ ILLUSTRATIONS = {
 @pytest.fixture
 def small_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """An empty folder, and few steps and samples whatever a block asks for."""
+    import matplotlib
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
     matplotlib.use("Agg")

@@ -22,7 +22,6 @@ from unrender.app.exporting.scene_folder import export
 from unrender.losses import metrics
 from unrender.scene.problem import Problem
 
-trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("pygltflib")
 pytestmark = pytest.mark.slow
 SPP = 128
@@ -59,6 +58,7 @@ def _load(path: Path) -> Any:
 
 def _rendered(glb: bytes, exported: Path) -> np.ndarray:
     """The picture of a .glb file under the exported light, for the scene's camera: what glTF says, in Mitsuba's plugins."""
+    trimesh = pytest.importorskip("trimesh")
     scene = trimesh.load(io.BytesIO(glb), file_type="glb", process=False)
     (mesh,) = scene.geometry.values()
     look = mesh.visual.material

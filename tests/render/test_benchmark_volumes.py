@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.volumes.fig11_smoke import run as race
-from benchmarks.volumes.fig11_smoke.scenes import DENSEST, EXTINCTION, FILE, measure, problem, smoothed
-
 SIZES = {"resolution": 8, "grid": 6, "reference_spp": 16}
+race: Any = None
+scenes: Any = None
+
+
+@pytest.fixture(autouse=True, scope="module")
+def with_benchmark() -> None:
+    """Import the benchmark here, not at collection: every test process would take a second for its figures."""
+    global race, scenes
+    race, scenes = (importlib.import_module(f"benchmarks.volumes.fig11_smoke.{name}") for name in ("run", "scenes"))
 
 
 def test_the_lamp_stands_in_the_same_smoke(tmp_path: Path) -> None:
-    plain, lit = (problem(name, assets=tmp_path, **SIZES) for name in ("smoke", "lit inside"))
+    plain, lit = (scenes.problem(name, assets=tmp_path, **SIZES) for name in ("smoke", "lit inside"))
     assert plain is not None
     assert lit is not None
     for key, values in plain.truth.items():
@@ -23,22 +30,22 @@ def test_the_lamp_stands_in_the_same_smoke(tmp_path: Path) -> None:
     outside, inside = (np.asarray(each.views[0].reference)[..., 0] for each in (plain, lit))
     assert inside[3:6, 3:6].max() > 4 * outside.max(), "the lamp shows"
     assert inside[0].max() < outside[0].min(), "and its sky is dim"
-    assert measure(lit)(lit.initial())["both"] == pytest.approx(1.0)
+    assert scenes.measure(lit)(lit.initial())["both"] == pytest.approx(1.0)
 
 
 def test_a_volume_of_a_file_is_resized_and_scaled_and_left_out_where_there_is_none(tmp_path: Path) -> None:
     import mitsuba as mi
 
-    assert problem("tutorial", assets=tmp_path, **SIZES) is None
+    assert scenes.problem("tutorial", assets=tmp_path, **SIZES) is None
     density = np.zeros((9, 7, 8, 1), np.float32)
     density[:4] = 0.25
-    (tmp_path / FILE).parent.mkdir()
-    mi.VolumeGrid(density).write(str(tmp_path / FILE))
-    made = problem("tutorial", assets=tmp_path, **SIZES)
+    (tmp_path / scenes.FILE).parent.mkdir()
+    mi.VolumeGrid(density).write(str(tmp_path / scenes.FILE))
+    made = scenes.problem("tutorial", assets=tmp_path, **SIZES)
     assert made is not None
-    found = made.truth[EXTINCTION]
+    found = made.truth[scenes.EXTINCTION]
     assert found.shape == (6, 6, 6, 1)
-    assert found.max() == pytest.approx(DENSEST)
+    assert found.max() == pytest.approx(scenes.DENSEST)
     assert not found[4:].any()
 
 
@@ -58,10 +65,10 @@ def test_what_plain_images_need_is_between_their_neighbours() -> None:
 
 
 def test_fine_grids_are_the_same_problem_with_smoothed_gradients(tmp_path: Path) -> None:
-    made = problem("lit inside", assets=tmp_path, **SIZES)
+    made = scenes.problem("lit inside", assets=tmp_path, **SIZES)
     assert made is not None
-    found = smoothed(made)
+    found = scenes.smoothed(made)
     for before, after in zip(made.parameters, found.parameters, strict=True):
         assert after.preconditioner is not None
         assert (after.key, after.learning_rate) == (before.key, before.learning_rate)
-    assert measure(found)(found.initial())["both"] == pytest.approx(1.0)
+    assert scenes.measure(found)(found.initial())["both"] == pytest.approx(1.0)

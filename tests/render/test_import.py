@@ -14,7 +14,6 @@ import pytest
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
 from PIL import Image
-from skimage.registration import phase_cross_correlation
 
 import made_capture as made
 from tiers import quick
@@ -73,6 +72,8 @@ def _seen(lens: Lens, local: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", quick(CASES, "instant-ngp, OpenCV"))
 def test_the_imported_scene_renders_what_the_photographs_show(name: str, mesh: Path, tmp_path: Path) -> None:
     """Normals in place of colours: no noise of light. To a tenth of a pixel."""
+    from skimage.registration import phase_cross_correlation
+
     lens, write = CASES[name]
     shots = made.shots(mesh, lens, 3)
     write(tmp_path / "capture", shots, lens)

@@ -9,7 +9,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 import unrender as ur
 from unrender.runs.callbacks import Callback
@@ -45,6 +44,8 @@ def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_p
     assert len(run.meshes[STATUE].first_faces) == 320
     before, after = (result.image_errors[f"view0/{which}"][0] for which in ("initial", "result"))
     assert after < before
+    import trimesh  # takes half a second, not at the collection of every process
+
     written: Any = trimesh.load(tmp_path / "run/meshes/statue.ply", process=False)
     np.testing.assert_array_equal(written.vertices.astype(np.float32).reshape(-1), result.parameters[STATUE])
     # What is exported renders what the last picture shows.

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from report_folders import write_run
 
 import unrender as ur
@@ -42,6 +41,8 @@ def written(folder: Path, **more: np.ndarray) -> Path:
 
 
 def test_ply_and_obj_are_read_again_as_they_were() -> None:
+    import trimesh  # takes half a second, not at the collection of every process
+
     vertices = POINTS[OF].astype(np.float32)
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     found: Any = trimesh.load(io.BytesIO(mesh_files.ply(vertices, CUT, normals, UV)), file_type="ply", process=False)
