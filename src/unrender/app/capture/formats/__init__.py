@@ -84,9 +84,7 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             capture = each.read(folder, masks)
             if not capture.photographs:
                 raise InputError(f"{folder}: all of its photographs are missing")
-            _check_places(capture, masks)
-            _check_photographs(capture)
-            _check_masks(capture)
+            _check(capture, masks)
             return capture
     if kind is not None:
         raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
@@ -95,32 +93,24 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
     )
 
 
-def _check_places(capture: Capture, masks: Path | None) -> None:
-    """Raise `InputError` if a photograph or a mask is outside the capture's folder; masks may also be in `masks`."""
-    for photograph in capture.photographs:
-        confinement.check(photograph.file, [capture.folder], f"{capture.folder}: it names the photograph")
-        if photograph.mask is not None:
-            places = [capture.folder] if masks is None else [capture.folder, masks]
-            confinement.check(photograph.mask, places, f"{capture.folder}: it names the mask")
-
-
-def _check_photographs(capture: Capture) -> None:
+def _check(capture: Capture, masks: Path | None) -> None:
+    """Raise `InputError` if a photograph or a mask is outside the capture's folder (masks may also be in `masks`), a photograph is listed
+    with two poses, or two photographs share a mask."""
     cameras: dict[Path, np.ndarray] = {}
+    owners: dict[Path, Path] = {}
     for photograph in capture.photographs:
-        pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
-        if not np.array_equal(pose, photograph.camera_to_world):
+        file, mask, pose = photograph.file, photograph.mask, photograph.camera_to_world
+        confinement.check(file, [capture.folder], f"{capture.folder}: it names the photograph")
+        if not np.array_equal(cameras.setdefault(file.resolve(), pose), pose):
             raise InputError(
                 f"{capture.folder}: {printable(photograph.name)}: listed twice, with different poses; expected one pose"
             )
-
-
-def _check_masks(capture: Capture) -> None:
-    owners: dict[Path, Path] = {}
-    for photograph in capture.photographs:
-        if photograph.mask is not None:
-            other = owners.setdefault(photograph.mask.resolve(), photograph.file)
-            if other != photograph.file:
-                two = f"{printable(str(other))} and {printable(str(photograph.file))}"
-                raise InputError(
-                    f"{photograph.mask}: shared by two photographs, {two}; put masks into folders like those of the photographs"
-                )
+        if mask is None:
+            continue
+        places = [capture.folder] if masks is None else [capture.folder, masks]
+        confinement.check(mask, places, f"{capture.folder}: it names the mask")
+        if (other := owners.setdefault(mask.resolve(), file)) != file:
+            two = f"{printable(str(other))} and {printable(str(file))}"
+            raise InputError(
+                f"{mask}: shared by two photographs, {two}; put masks into folders like those of the photographs"
+            )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -158,9 +157,7 @@ class OnWorkers:
         with contextlib.suppress(Exception):
             for reference in self._begun:
                 self._ray.cancel(reference)
-            until = time.monotonic() + _GRACE_SECONDS
-            waiting = list(self._begun)
-            self._cluster.wait(waiting, len(waiting), max(until - time.monotonic(), 0.0))
+            self._cluster.wait(list(self._begun), len(self._begun), _GRACE_SECONDS)
 
 
 def _reason(error: BaseException) -> str:
