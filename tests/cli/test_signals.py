@@ -146,10 +146,7 @@ def test_a_run_that_is_given_up_is_no_success(unrender, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(PathGradient, "estimate", estimate)
     answer = unrender("run", *TOY, "--out", "run", "--variant", mitsuba_variant)
-    assert (answer.status, answer.error) == (
-        4,
-        "unrender: the run failed: it was stopped, and the last finite values are saved\n",
-    )
+    assert (answer.status, answer.error) == (4, "unrender: failed: the lines above name the cause\n")
     assert "failed: stopped after 23 steps; the result has the values of the 3 applied steps" in answer.out
     assert "to try once more from its last step: unrender resume run" in answer.out
     assert json.loads(Path("run/run.json").read_text())["status"] == "failed"

@@ -181,6 +181,7 @@ def test_a_stage_is_judged_with_what_earlier_ones_found(unrender: Unrender, stag
         ("share = 2", "shares = 2", "stages.toml:17: stages[2].shares: no such field; did you mean share?"),
         ("spp = 4", "ssp = 4", "stages.toml: stage light: method plain has no option ssp; did you mean spp?"),
         ('"plain"', '"plane"', "did you mean plain?"),
+        ("[[stages]]", "[[stage]]", "stages.toml:5: stage: no such field; did you mean stages?"),
         (f'unknowns = ["{KEY}"]', "", "stages.toml:5: stages[0].unknowns: missing, expected a list"),
         ("sky.radiance.value", "sky.radiance", "stage light: sky.radiance is no parameter of"),
     ],

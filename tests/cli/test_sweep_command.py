@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import typer
@@ -113,6 +114,20 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
     assert sweep_json()["best"] == 1
     assert unrender("sweep", "s").status == 0  # tried once more
     assert [trial["status"] for trial in sweep_json()["trials"]] == ["finished", "finished"]
+
+
+@pytest.mark.slow
+def test_a_sweep_whose_problem_has_changed_is_not_continued(unrender, problem: Path, mitsuba_variant: str) -> None:
+    over = ["--over", "learning_rate=0.001:0.1:log", "--search", "random", "--trials", 1, "--steps", 2]
+    over += ["--final-spp", 2, "--variant", mitsuba_variant, "--out", "s"]
+    assert unrender("sweep", "problem.toml", "-m", "plain", *over).status == 0
+    assert unrender("sweep", "s", "--trials", 2).status == 0
+    mi.Bitmap(np.ones((4, 6, 3), np.float32)).write("photo.exr")
+    answer = unrender("sweep", "s", "--trials", 3)
+    assert answer.refuses(
+        "s: its problem has changed since trial 0: view 0: reference has changed; begin another sweep"
+    )
+    assert len(trials("s")) == 2
 
 
 SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>

@@ -101,6 +101,16 @@ def test_a_mask_blends_and_a_weight_scales() -> None:
     np.testing.assert_allclose(found[0].gradient["map"], found[1].gradient["map"], rtol=1e-6)
 
 
+def test_it_may_change_its_arguments() -> None:
+    def in_place(image: Any, reference: Any) -> Any:
+        image -= reference
+        return dr.mean(dr.square(image), axis=None)
+
+    found = [ur.estimate(problem(loss), ur.PathGradient(spp=4)) for loss in (of_drjit, in_place)]
+    assert np.abs(found[0].gradient["map"]).max() > 0
+    np.testing.assert_array_equal(found[0].gradient["map"], found[1].gradient["map"])
+
+
 def test_one_of_the_image_alone() -> None:
     def brightness(image: Any) -> Any:
         return dr.square(dr.mean(image, axis=None) - 0.5)

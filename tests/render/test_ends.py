@@ -110,6 +110,13 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
     assert reader.read(folder).record.status == "failed"
 
 
+@pytest.mark.parametrize("steps", [3, 20])
+def test_a_short_run_without_a_finite_step_has_failed(steps: int) -> None:
+    result = start(None, steps, optimizer=Exploding(since=0))
+    assert (result.status, result.stopped, result.skipped) == ("failed", "non-finite", steps)
+    assert result.warnings[-1].startswith(f"{steps} steps in a row were not finite")
+
+
 def test_bounds_do_not_hide_a_step_that_is_no_number(tmp_path: Path) -> None:
     """The nearest point inside the bounds to what is no number may be a bound."""
     made = ur.gallery.problem("exponential")

@@ -114,6 +114,7 @@ MISTAKES = [
     ('"L1"', '"L1', 2, "not valid TOML: "),
     ('"L1"', '"L1" "L2"', 2, "not valid TOML: "),
     ('loss = "L1"', 'scene = "again.xml"', 2, "not valid TOML: "),
+    ("[[parameters]]", "[parameters]\n[[parameters]]", 4, "not valid TOML: Cannot "),
     # names of fields
     ("scene =", "scen =", 1, "scen: no such field; did you mean scene?"),
     (

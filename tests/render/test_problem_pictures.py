@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import struct
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -83,6 +86,42 @@ def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
         picture.save(tmp_path / f"{name}.png", icc_profile=profile)
     assert images.check_metadata(tmp_path / "sRGB.png") == ""
     assert "LAB.png: its colour profile is not sRGB" in images.check_metadata(tmp_path / "LAB.png")
+
+
+def test_a_gamma_other_than_that_of_srgb_is_refused_in_a_reference_and_not_in_a_mask(tmp_path: Path):
+    Image.fromarray(np.full((8, 8, 3), 188, np.uint8)).save(tmp_path / "plain.png")
+    data = (tmp_path / "plain.png").read_bytes()
+    films: Any = SimpleNamespace(resolutions=lambda: [(8, 8)])
+    for gamma, refused in ((100_000, True), (55_556, True), (45_455, False)):
+        chunk = b"gAMA" + struct.pack(">I", gamma)
+        body = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        (tmp_path / "a.png").write_bytes(data[:33] + body + data[33:])
+        check_views([View(np.ones((8, 8, 3)), mask=tmp_path / "a.png")], films, L2())
+        with pytest.raises(InputError, match="declares a gamma of") if refused else contextlib.nullcontext():
+            check_views([View(tmp_path / "a.png")], films, L2())
+
+
+def test_colours_of_adobe_rgb_without_a_profile_are_reported(tmp_path: Path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    Image.fromarray(np.full((8, 8, 3), 188, np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    assert "a.jpg: its colour profile is not sRGB" in images.check_metadata(tmp_path / "a.jpg")
+
+
+def test_a_bitmap_is_read_as_its_file(tmp_path: Path):
+    """In its own colour space, and left as it is."""
+    rgb, kinds, form = mi.Bitmap(COLOURS), mi.Struct.Type, mi.Bitmap.PixelFormat
+    linear = rgb.convert(form.RGB, kinds.UInt8, False)
+    xyz: Any = rgb.convert(form.XYZ, kinds.Float32, False)
+    for bitmap_of in (xyz, rgb.convert(form.RGB, kinds.UInt8, True), linear):
+        np.testing.assert_allclose(images.read(bitmap_of).values, COLOURS, atol=0.01)
+    assert images.read(linear).notice == ""
+    mask = rgb.convert(form.RGB, kinds.UInt8, True)
+    np.testing.assert_allclose(images.read(mask, linearise=False).values, np.array(mask) / 255, atol=1e-6)
+    assert mask.srgb_gamma()
+    films: Any = SimpleNamespace(resolutions=lambda: [(6, 8)])
+    view = check_views([View(xyz)], films, L2())[0][0]
+    np.testing.assert_allclose(np.asarray(view.reference), COLOURS, atol=1e-5)
 
 
 def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):

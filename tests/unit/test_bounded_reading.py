@@ -76,8 +76,26 @@ def test_a_large_picture_of_few_bytes_is_refused(tmp_path: Path):
 
 def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
     data = _noise("JPEG", progressive=True)
-    (tmp_path / "a.jpg").write_bytes(data + b"\xff\xda" * 200)
+    (tmp_path / "a.jpg").write_bytes(data[:-2] + b"\xff\xda\0\2" * 200 + data[-2:])
     with pytest.raises(InputError, match="more than 100 scans"):
+        image_size.check(tmp_path / "a.jpg")
+    (tmp_path / "a.jpg").write_bytes(data + b"\xff\xda\0\2" * 200)  # a video after the picture
+    assert image_size.check(tmp_path / "a.jpg") > 0
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_that_ends_too_soon_is_refused(tmp_path: Path, progressive: bool):
+    """Decoders fill the rest with grey. The end of its thumbnail is not that of the picture."""
+    exif = Image.Exif()
+    exif[0x927C] = _noise("JPEG")[:60_000]
+    file = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(
+        file, "JPEG", progressive=progressive, exif=exif
+    )
+    (tmp_path / "a.jpg").write_bytes(file.getvalue())
+    assert image_size.check(tmp_path / "a.jpg") == 3 * 64 * 64
+    (tmp_path / "a.jpg").write_bytes(file.getvalue()[:-200])
+    with pytest.raises(InputError, match="the file ends before the picture does"):
         image_size.check(tmp_path / "a.jpg")
 
 

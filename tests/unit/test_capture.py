@@ -413,7 +413,7 @@ def test_only_errors_of_pillow_are_errors_of_the_picture(tmp_path: Path, monkeyp
 def test_a_photograph_of_a_thousand_scans_is_refused(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (8, 6)).save(buffer, "JPEG", progressive=True)
-    (tmp_path / "a.jpg").write_bytes(buffer.getvalue() + 1000 * b"\xff\xda")
+    (tmp_path / "a.jpg").write_bytes(buffer.getvalue()[:-2] + 1000 * b"\xff\xda\0\2")
     with pytest.raises(InputError, match=r"a\.jpg: cannot be read as a picture: more than 100 scans"):
         pictures.upright(tmp_path / "a.jpg", None)
 

@@ -127,7 +127,6 @@ def test_opencv_decodes_kinds_of_the_allow_list_alone(tmp_path: Path, monkeypatc
 def test_pictures_are_decoded_in_a_few_modules_alone() -> None:
     """Whoever decodes a file elsewhere goes round the allow-list and the guards."""
     allowed = {
-        "io/image_size.py": {"open"},
         "io/images.py": {"Bitmap", "open"},
         "app/capture/pictures.py": {"open", "imdecode"},
         "gallery/parts.py": {"open"},

@@ -64,6 +64,12 @@ def path(where: str, value: Any, what: str = "a folder") -> Path:
     raise InputError(f"{where}: expected {what}, got {in_words(value)}")
 
 
+def optional(where: str, value: Any, kind: type, what: str) -> None:
+    """Raise `InputError` unless `value` is None or an instance of `kind`."""
+    if value is not None and not isinstance(value, kind):
+        raise InputError(f"{where}: expected {what}, got {in_words(value)}")
+
+
 def limits(low: float | None, high: float | None) -> list[str]:
     """Return the ends of a range in words, for messages; None is open."""
     return [f"{word} {end:g}" for word, end in (("at least", low), ("at most", high)) if end is not None]

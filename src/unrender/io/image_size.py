@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import re
 import struct
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
-
-from PIL import Image
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, tiff_header
@@ -33,6 +30,8 @@ _MOST_SCANS = 100
 _MOST_SCANNED = 1 << 30
 """Largest product of pixels and scans of a JPEG file: each scan covers the entire image, and may have a few bytes."""
 _WEBP_ANIMATION = 0x02
+_JPEG_MARKER, _JPEG_SCAN, _JPEG_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]"), 0xDA, 0xD9
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _FARTHEST = 1 << 30
 
 
@@ -76,11 +75,9 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
             contents = reader(data, file)
     except InputError as error:
         raise InputError(str(error).removeprefix(f"{path}: ")) from error
-    except Image.DecompressionBombError as error:
-        raise InputError(f"cannot be read as a picture: {error}") from error
     except MemoryError:
         raise
-    except Exception as error:  # Pillow raises many types of exceptions
+    except Exception as error:  # readers of malformed headers raise many types of exceptions
         raise InputError(f"cannot be read as a picture: its header is malformed ({type(error).__name__})") from error
     header = (
         Header(kind, contents)
@@ -321,24 +318,31 @@ def _check_chunks(file: IO[bytes]) -> None:
     raise InputError(f"cannot be read as a picture: more than {_MOST_CHUNKS} chunks")
 
 
-def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
+def _jpeg(_: bytes, file: IO[bytes]) -> Sizes:
+    """Return the size. Raise `InputError` for too many scans, and where a file ends before its picture, which libjpeg fills with grey.
+
+    Thumbnails before the picture and videos after it do not count.
+    """
     file.seek(0)
-    scans = sum(block.count(b"\xff\xda") for block in iter(lambda: file.read(_HEADER), b""))
-    if scans > _MOST_SCANS:
-        raise InputError(f"cannot be read as a picture: more than {_MOST_SCANS} scans")
-    file.seek(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the size is checked below
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            with Image.open(file, formats=["JPEG"]) as image:
-                size = image.size
-                channels = len(image.getbands())
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
-    if scans * size[0] * size[1] > _MOST_SCANNED:
-        raise InputError(f"cannot be read as a picture: {scans} scans of {size[0]}x{size[1]} pixels")
-    return [(*size, channels)]
+    data, sizes, scans, at = file.read(), list[tuple[int, int, int]](), 0, 2
+    while scans <= _MOST_SCANS and (marker := _JPEG_MARKER.search(data, at)):
+        kind, start = marker[0][1], marker.end()
+        if kind == _JPEG_END:
+            break
+        if kind in _JPEG_FRAMES:
+            height, width, channels = struct.unpack_from(">HHB", data, start + 3)
+            sizes.append((width, height, channels))
+        scans += kind == _JPEG_SCAN
+        at = start + max(int.from_bytes(data[start : start + 2], "big"), 2)
+    else:
+        fault = f"more than {_MOST_SCANS} scans" if scans > _MOST_SCANS else "the file ends before the picture does"
+        raise InputError(f"cannot be read as a picture: {fault}")
+    if len(sizes) != 1:
+        raise ValueError("no frame, or several")
+    width, height = sizes[0][:2]
+    if scans * width * height > _MOST_SCANNED:
+        raise InputError(f"cannot be read as a picture: {scans} scans of {width}x{height} pixels")
+    return sizes
 
 
 _MITSUBA: tuple[_Kind, ...] = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,8 @@ from unrender.io import bounded_files, image_size
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name extensions that `read` supports."""
 
-_ORIENTATION = 0x0112
+_ORIENTATION, _INTEROPERABILITY = 0x0112, 0xA005
+_GAMMA = 2.2
 OPAQUE = 0.999
 """Least alpha that counts as 1."""
 _COUNTED = "only its opaque pixels count"
@@ -48,9 +50,9 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
     """Read an image from a file or an array.
 
     Args:
-        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Floating-point values are linear. Unsigned
-            integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other integers and booleans must be 0 or 1, as in
-            masks.
+        source: a file (`READABLE`), a `mitsuba.Bitmap`, or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Floating-point values are
+            linear. Unsigned integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other integers and booleans must be 0
+            or 1, as in masks.
         linearise: whether to convert 8- and 16-bit values from sRGB; False for masks.
         alpha: whether to return the alpha of 8- and 16-bit values.
         channels: numbers of channels that arrays may have; the second of 2 channels is alpha.
@@ -78,22 +80,32 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
     try:
         array = np.asarray(source)
     except (TypeError, ValueError) as error:
-        raise InputError(f"expected a file or an array, got {type(source).__name__}") from error
-    picture = _from_array(array, linearise, alpha, channels)
+        what = f"expected a file or an array, got {type(source).__name__}"
+        raise InputError(f"{what}: {reason_of(error, 100)}") from error
+    if is_bitmap(source) and array.dtype in (np.uint8, np.uint16, np.float16, np.float32):
+        picture = _of_bitmap(type(source)(source), linearise, alpha)
+    else:
+        picture = _from_array(array, linearise, alpha, channels)
     refuse_pixels(~np.isfinite(picture.values), "NaN or infinite")
     return picture
 
 
-def check_metadata(source: Any) -> str:
+def is_bitmap(source: Any) -> bool:
+    """Return whether a source is a `mitsuba.Bitmap`, which knows its colour space."""
+    return type(source).__name__ == "Bitmap" and type(source).__module__.startswith("mitsuba")
+
+
+def check_metadata(source: Any, linearised: bool = False) -> str:
     """Return one line about a JPEG or PNG file's colour profile if it is not sRGB; "" for none, and for other sources.
 
     Mitsuba ignores profiles and EXIF. `source` is one that `read` has read, so that its size is within the limits.
 
-    Raises `InputError` for a file whose EXIF orientation turns or mirrors its pixels.
+    Raises `InputError` for a file whose EXIF orientation turns or mirrors its pixels, and for one that was `linearised` from sRGB but
+    declares another gamma.
     """
     if not isinstance(source, (str, Path)) or Path(source).suffix.lower() not in (".jpg", ".jpeg", ".png"):
         return ""
-    path = Path(source)
+    path, adobe = Path(source), False
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -101,13 +113,20 @@ def check_metadata(source: Any) -> str:
                 if picture.format == "PNG":
                     picture.load()  # EXIF may follow the pixels
                 profile, turned = picture.info.get("icc_profile") or b"", orientation(picture)
+                with contextlib.suppress(Exception):  # EXIF data is often malformed
+                    adobe = picture.getexif().get_ifd(_INTEROPERABILITY).get(1) == "R03"
+                gamma = 1 / _GAMMA if profile or "srgb" in picture.info else picture.info.get("gamma") or 1 / _GAMMA
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
         return ""
     if turned != 1:
         raise InputError(
             f"{path}: its EXIF orientation is {turned}, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
         )
-    known = not profile or any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
+    if linearised and abs(_GAMMA * gamma - 1) > 0.05:
+        raise InputError(
+            f"{path}: it declares a gamma of {gamma:.3g}, that of sRGB is 0.455; convert it to sRGB, or to floating-point .exr"
+        )
+    known = not adobe if not profile else any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
     return "" if known else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
 
 
@@ -178,36 +197,46 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
 
     try:
         with variant.two_threads():
-            bitmap: Any = mi.Bitmap(str(path))
-        names = [field.name for field in bitmap.struct_()]
-        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel or not {*names} <= {*"RGBAXYZ"}:
-            return _colour_channels(np.array(bitmap), names)
-        encoded = bool(bitmap.srgb_gamma())
-        stored = np.array(bitmap)
-        bits = 8 * stored.itemsize
-        linearised = encoded and linearise
-        transparent = encoded and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
-        single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
-        kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
-        if encoded and not linearise:
-            bitmap.set_srgb_gamma(False)
-        values = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False))
+            bitmap = mi.Bitmap(str(path))
+        return _of_bitmap(bitmap, linearise, alpha)
     except InputError:
         raise
     except Exception as error:  # Mitsuba's image libraries may raise anything
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
+
+
+def _of_bitmap(bitmap: Any, linearise: bool, alpha: bool) -> Picture:
+    """Return the picture of a `mitsuba.Bitmap`, whose gamma is changed."""
+    import mitsuba as mi
+
+    names = [field.name for field in bitmap.struct_()]
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel or not {*names} <= {*"RGBAXYZ"}:
+        return _colour_channels(np.array(bitmap), names)
+    encoded = bool(bitmap.srgb_gamma())
+    stored = np.array(bitmap)
+    bits = 8 * stored.itemsize
+    linearised = encoded and linearise
+    opaqueness = _coverage(stored[..., -1]) if bitmap.has_alpha() else np.ones(1, np.float32)
+    transparent = encoded and opaqueness.min() < 1
+    single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
+    kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
+    if encoded and not linearise:
+        bitmap.set_srgb_gamma(False)
+    values = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False))
     values = values.reshape(*values.shape[:2], -1)
-    coverage = _coverage(stored[..., -1]) if transparent and alpha else None
+    coverage = opaqueness if transparent and alpha else None
     if not linearised:
         labelled = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.XYZ, mi.Bitmap.PixelFormat.XYZA)
-        opacity = _opacity(stored[..., -1]) if bitmap.has_alpha() and not encoded else None
+        opacity = None if encoded else _opacity(opaqueness)
         return Picture(values, "", coverage if encoded else opacity, labelled, opacity is not None)
     note = f", {'its alpha left out' if coverage is None else _COUNTED}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
 
 
 def _coverage(stored: np.ndarray) -> np.ndarray:
-    return (stored / np.float32(np.iinfo(stored.dtype).max)).astype(np.float32)
+    return (stored / np.float32(np.iinfo(stored.dtype).max if stored.dtype in (np.uint8, np.uint16) else 1)).astype(
+        np.float32
+    )
 
 
 def _opacity(alpha: np.ndarray) -> np.ndarray | None:

@@ -59,7 +59,8 @@ def parse(text: str, where: str) -> dict[str, Any]:
         line, _, column = tail.rstrip(")").removeprefix("line ").partition(", ")
         if not line.isdigit():
             raise InputError(f"{where}:{text.rstrip().count(chr(10)) + 1}: not valid TOML: {message}") from error
-        raise InputError(f"{where}:{line}: not valid TOML: {head} ({column})") from error
+        hint = ": the name is given above already; each table of a list begins with [[NAME]]" * ("Cannot" in head)
+        raise InputError(f"{where}:{line}: not valid TOML: {head}{hint} ({column})") from error
     except RecursionError as error:
         raise InputError(f"{where}: not valid TOML: nested too deeply") from error
     except ValueError as error:  # excessively long numbers

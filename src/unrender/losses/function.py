@@ -128,7 +128,8 @@ def _with_drjit(loss: FunctionLoss, image: Array, reference: Array, derivative: 
     with dr.resume_grad() if derivative else dr.suspend_grad():
         if derivative:
             dr.enable_grad(tensor)
-        result = loss.function(tensor, *([_detached(reference, kind)] if loss.takes_reference else []))
+        # A copy, since a function may change its arguments.
+        result = loss.function(kind(tensor), *([_detached(reference, kind)] if loss.takes_reference else []))
         if (
             not arrays.is_drjit(result)
             or dr.width(result) != 1

@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import KeyedError
+from unrender.core.text import did_you_mean
 
 Function = Callable[[Any], Any]
 """A function of values by name; see `Expression`."""
@@ -108,5 +109,10 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
                 raise KeyedError(key, f"{name} takes {count} arguments, got {len(args)}")
             parts = [inner(part) for part in args]
             return lambda values: function(*(part(values) for part in parts))
-    allowed = f"numbers, lists, unknowns, + - * / **, name[0], {', '.join(_FUNCTIONS)}"
+    hint = (
+        did_you_mean(node.func.id, _FUNCTIONS) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
+    )
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
+        hint = "; a power is **"
+    allowed = f"numbers, lists, unknowns, + - * / **, name[0], {', '.join(_FUNCTIONS)}{hint}"
     raise KeyedError(key, f"{ast.unparse(node)!r:.60} is not allowed; there are {allowed}")

@@ -87,7 +87,9 @@ class ExpressionRenderer(DerivedRenderer):
         start = {name: inner.array(value) for name, value in self.unknowns.items()}
         self.reads = {one.key: self._checked(one, known, start) for one in self.expressions}
         if unread := next((name for name in start if not any(name in names for names in self.reads.values())), None):
-            raise InputError(f"{unread}: neither a parameter of the scene nor read by an expression")
+            others = [*(name for names in self.reads.values() for name in names), *known]
+            hint = did_you_mean(unread, others)
+            raise InputError(f"{unread}: neither a parameter of the scene nor read by an expression{hint}")
         targets = {name: [key for key, names in self.reads.items() if name in names] for name in self.unknowns}
         infos = {name: _info(self.unknowns[name].shape, [known[key] for key in keys]) for name, keys in targets.items()}
         lost = {
@@ -211,9 +213,10 @@ def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknown
         except (TypeError, ValueError):
             starts[name] = np.full(1, np.nan, np.float32)
         if value is None or not starts[name].size or not np.isfinite(starts[name]).all():
-            raise InputError(
-                f"{name}: an unknown of expressions needs an initial value: a number, or a list or array of these"
-            )
+            if value is None and (hint := did_you_mean(name, known)):
+                raise InputError(f"{name}: the scene has no parameter {name}{hint}")
+            what = "an unknown of expressions needs a finite initial value"
+            raise InputError(f"{name}: {what}: a number, or a list or array of these")
     if not starts:
         first = next(iter(expressions))
         raise KeyedError(first, "there is no unknown to read; name one that is no parameter of the scene")

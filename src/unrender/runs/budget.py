@@ -73,6 +73,8 @@ class Budget(Callback):
 
     def _check(self, run: Run) -> None:
         self._set_last_step(run)
+        if run.state.skipped_in_a_row >= _MOST_SKIPPED:
+            run.stop(NON_FINITE)
         if run.steps is not None and run.step >= run.steps:
             run.stop("steps")
         if run.seconds is not None and run.clock >= run.seconds:
@@ -81,9 +83,13 @@ class Budget(Callback):
             run.stop("seconds")
         if run.step and (run.stopped or run.step == _MEASURED):
             _warn_of_few_steps(run)
-        if run.state.skipped_in_a_row >= _MOST_SKIPPED:
-            run.stop(NON_FINITE)
-            line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was stopped; the result holds the last finite values"
+        if run.stopped in ("steps", "seconds") and 0 < run.step == run.skipped:
+            run.stopped = NON_FINITE
+        if run.stopped == NON_FINITE:
+            count = run.state.skipped_in_a_row
+            line = (
+                f"{count} steps in a row were not finite: the run was stopped; the result holds the last finite values"
+            )
             if line not in run.warnings:
                 run.warnings.append(line)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.exclusive import exclusive
@@ -55,8 +55,7 @@ __all__ = ["Bounds", "Problem", "open_scene"]
 class Problem(ViewLosses):
     """A scene, its unknown parameters, and the reference images.
 
-    The constructor reads and checks everything. A problem does not change afterwards: its caches hold device copies of the references and
-    masks, which are constant.
+    The constructor reads and checks everything. A problem does not change afterwards: its caches hold copies on the device.
 
     Args:
         scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a `protocols.Renderer`. A loaded
@@ -126,6 +125,8 @@ class Problem(ViewLosses):
         partial: bool = False,
     ):
         check_max_depth(max_depth)
+        checks.optional("name", name, str, "text")
+        checks.optional("truth", truth, Mapping, "values by key of the parameters")
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
@@ -181,13 +182,11 @@ class Problem(ViewLosses):
         Truths and true surfaces stay for parameters that are still unknown. `origin` keeps only the scene's file. Raises `InputError` as
         `Problem` does.
         """
-        checked_parameters = (
-            self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
-        )
-        keys = {parameter.key for parameter in checked_parameters if isinstance(parameter.key, str)}
+        given = self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
+        keys = {parameter.key for parameter in given if isinstance(parameter.key, str)}
         made = Problem(
             self.renderer,
-            checked_parameters,
+            given,
             self.original_views if views is None else views,
             self.loss if loss is None else loss,
             requested_depth(self.renderer, self.original_views, self.max_depth),
@@ -396,5 +395,6 @@ def open_scene(
     except InputError as error:
         name, _, what = str(error).partition(": ")
         index = [parameter.key for parameter in parameters].index(name)
-        raise FieldError(("parameters", index, "key"), what, f"parameter {name}") from error
+        field, what = ("initial", what[9:]) if what.startswith("initial: ") else ("key", what)
+        raise FieldError(("parameters", index, field), what, f"parameter {name}") from error
     return tied(renderer, parameters, ties_of(parameters))

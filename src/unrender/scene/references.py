@@ -58,6 +58,10 @@ class View:
     scene: str | Path | dict[str, Any] | Callable[[], Any] | Any = None
     aov: str | None = None
 
+    def __post_init__(self) -> None:
+        if isinstance(self.sensor, np.integer):  # files store Python's integers alone
+            object.__setattr__(self, "sensor", int(self.sensor))
+
     @property
     def own_world(self) -> bool:
         """Return whether the view shows other values, another scene or another quantity than the problem's scene."""

@@ -79,7 +79,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     channels = {"luminance": (1, 2), "xyz": (3, 4), "rgb": (1, 3, 4)}[form.colour]
     try:
         image = images.read(source, alpha=True, channels=channels)
-        profile = images.check_metadata(source)
+        profile = images.check_metadata(source, bool(image.notice))
     except InputError as error:
         if form.colour == "rgb" or "expected an array of shape" not in str(error):
             raise
@@ -120,7 +120,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
 def _of_aov(source: Any, name: str) -> Reference:
     """Read the reference of an AOV. The alpha of a mask in 8 or 16 bits is the mask; other integer values are sRGB albedos."""
     image = images.read(source, alpha=True)
-    images.check_metadata(source)
+    images.check_metadata(source, name == "albedo" and bool(image.notice))
     values, notices = image.values, []
     if name == "mask" and image.notice:
         values, notices = _unscaled(source)
@@ -151,9 +151,9 @@ def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
 
 def _is_of_film(source: Any) -> bool:
     """Return whether the values are in the film's format, with no colour space of their own."""
-    path = isinstance(source, (str, Path))
-    integers = not path and np.asarray(checks.array_like(source, "")).dtype in (np.uint8, np.uint16)
-    return not integers and (not path or Path(source).suffix.lower() == ".npy")
+    if isinstance(source, (str, Path)):
+        return Path(source).suffix.lower() == ".npy"
+    return not (images.is_bitmap(source) or np.asarray(checks.array_like(source, "")).dtype in (np.uint8, np.uint16))
 
 
 def _check_not_negative(values: np.ndarray) -> None:

@@ -27,7 +27,7 @@ INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
 INTERRUPTED, TERMINATED = 130, 143
 """Exit status after Ctrl-C and SIGTERM: 128 plus the number of the signal, as shells and schedulers expect."""
 WORDS = {
-    FAILED: "the run failed: it was stopped, and the last finite values are saved",
+    FAILED: "failed: the lines above name the cause",
     DOUBTFUL: "the result is doubtful: see the warnings",
     INTERRUPTED: "interrupted",
     TERMINATED: "terminated",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import secrets
 import shlex
 import time
@@ -42,11 +43,15 @@ from unrender.display.terminal import Console, columns
 from unrender.io import files
 from unrender.runs.budget import few_steps
 from unrender.runs.folder.lock import Lock
-from unrender.runs.folder.schema import DOUBTFUL, ENDED
+from unrender.runs.folder.reader import read_run_record
+from unrender.runs.folder.schema import DOUBTFUL, ENDED, RECORD
 from unrender.runs.result import TERMINATED as BY_SIGTERM
+from unrender.scene.fingerprint import differences, fingerprint, shortened
 from unrender.scene.problem import Problem
 
 _SHOWN = 10
+_PART = re.compile(r"file |loss|max_depth|view |expression of|parameter .*: bounds")
+"""Parts of a fingerprint that the files of a problem decide alone."""
 _MANY = 1e9  # degrees of freedom of a standard error that is known
 
 
@@ -248,6 +253,7 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
                 check_threads(session.threads)
         running = arguments.use_variant(plan.variant, None if cluster else session.threads)
         problem = arguments.open_problem(plan.problem, plan.problem_settings, plan.cached)
+        _check_unchanged(session.folder, problem)
         if plan.final_spp == 1 and not problem.has_truth:
             raise InputError(
                 "--final-spp: expected 2 or more, since trials without a truth are ranked by final pictures"
@@ -267,6 +273,19 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
             yield OnWorkers(cluster, tasks.on_worker), job, problem, cluster.variant
         else:
             yield InProcess(lambda job, runs: (tasks.in_turn(job, runs, problem), {})), job, problem, running
+
+
+def _check_unchanged(folder: Path, problem: Problem) -> None:
+    """Raise `InputError` if a problem file, its scene or its pictures have changed since the first run of a sweep, whose error was another
+    one. Parts that a method or a device changes do not count."""
+    first = next((run for run in sorted(folder.glob(RUN_FOLDERS)) if (run / RECORD).is_file()), None)
+    before = None if first is None else read_run_record(first).problem.fingerprint
+    if before is None or "file" not in problem.origin:
+        return
+    both = ({part: x for part, x in of.items() if _PART.match(part)} for of in (before, fingerprint(problem)))
+    if changes := differences(*both):
+        what = f"its problem has changed since trial 0: {shortened(changes)}"
+        raise InputError(f"sweep {folder}: {what}; begin another sweep, or take the change back")
 
 
 def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:

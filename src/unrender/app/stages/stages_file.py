@@ -110,7 +110,7 @@ def is_stages(path: Path) -> bool:
     """Return whether a TOML file describes stages, not a problem; False for a file that cannot be read, whose error a later reader
     reports."""
     content = _parsed(path)
-    return "stages" in content and "scene" not in content
+    return bool({"stages", "problem"} & content.keys()) and "scene" not in content
 
 
 def is_of_run(path: Path) -> bool:

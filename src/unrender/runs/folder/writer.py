@@ -220,7 +220,7 @@ class RunWriter(Callback):
             result = with_few_steps(run.problem, result)
             result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
-        self._guarded("meshes", lambda: write_files(self.folder, run.problem, result.parameters))
+        self._guarded("meshes", lambda: write_files(self.folder, run.problem, result.parameters), "")
         return result
 
     def on_error(self, run: Run, error: BaseException) -> None:
@@ -229,7 +229,7 @@ class RunWriter(Callback):
             return
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         message = reason_of(error, 300)
-        self._guarded("end", lambda: contents.write_record(self.folder, run.result(), status, message))
+        self._guarded("end", lambda: contents.write_record(self.folder, run.result(), status, message), "")
 
     # ------------------------------------------------------------------ the parts of a step
 
@@ -331,12 +331,12 @@ class RunWriter(Callback):
             f"run folder {self.folder}: deleted during the run; it was created again, without the earlier checkpoints"
         )
 
-    def _guarded(self, what: str, write: Callable[[], None]) -> None:
+    def _guarded(self, what: str, write: Callable[[], None], after: str = "; the run continues") -> None:
         try:
             write()
         except (OSError, InputError, TypeError) as error:
             reason = (error.strerror if isinstance(error, OSError) else "") or str(error)
-            line = f"run folder {self.folder}: {what} not written: {reason}; the run continues"
+            line = f"run folder {self.folder}: {what} not written: {reason}{after}"
             self._warn_once(line, f"{what} {reason[-60:]}")
 
     def _warn_once(self, line: str, topic: str = "") -> None:
