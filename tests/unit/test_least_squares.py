@@ -17,7 +17,7 @@ from unrender.estimators.base import pixel_weights
 from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.estimators.hybrid import HybridState
 from unrender.rendering.renderer import SampleRequest
-from unrender.runs import least_squares
+from unrender.runs import field_directions, least_squares
 from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers
 from unrender.runs.numbers import Differences, Numbers
 from unrender.runs.reference_distortions import distortions
@@ -375,7 +375,9 @@ def test_rare_bright_samples_at_the_ends_of_differences_leave_no_number_open(
     if not weighted:  # planted fault
         monkeypatch.setattr(Differences, "weights", lambda self: np.ones(len(self.one)))
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), FAR)
-    assert bool(found.undetermined) is not weighted
+    error = NOISE / np.linalg.norm(MATRIX[:, 3])
+    right = not found.undetermined and bool(0.5 * error < found.errors["b"] < 2.0 * error)
+    assert right is weighted
 
 
 def test_the_error_of_a_step_is_at_least_that_of_the_check():
@@ -799,3 +801,32 @@ def test_a_number_whose_solution_is_beyond_its_bound_has_no_standard_error(high:
     check = check_numbers(made, values, made.initial_values(), FAR)
     assert np.isfinite(check.errors["a"]).tolist() == [finite, True, True]
     assert np.isfinite(check.errors["b"]).all()
+
+
+def test_errors_are_those_of_slopes_at_the_end_where_pictures_change_faster_further_off(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """A tenth of the slope within 0.1 of the solution, and all of it beyond, as where a sun lights another face. The planted fault are long
+    differences: they state a tenth to a half of the error, and of the distance."""
+    made, inner = problem(MATRIX), Numbers.pictures
+    near = MATRIX * [1.0, 1.0, 1.0, 0.1]
+
+    def pictures(self: Numbers, points: np.ndarray, key: Key) -> np.ndarray:
+        seen, off = points.copy(), points[:, 3] - TRUTH["b"]
+        seen[:, 3] = TRUTH["b"] + np.sign(off) * np.maximum(0.1 * np.abs(off), np.abs(off) - 0.09)
+        return inner(self, seen, key)
+
+    monkeypatch.setattr(Numbers, "pictures", pictures)
+    target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0 - 0.9 * TRUTH["b"] * MATRIX[:, 3]
+    solution = np.linalg.lstsq(near, target, rcond=None)[0]
+    residual, inverse = target - near @ solution, np.linalg.inv(near.T @ near)
+    scores = (near * residual[:, None]).reshape(-1, 3, 4).sum(axis=1)
+    expected = np.sqrt((inverse @ scores.T @ scores @ inverse)[3, 3])
+    end = at(solution + [0.0, 0.0, 0.0, 0.04])
+    found = check_numbers(made, end, made.initial_values(), FAR)
+    assert found.errors["b"] == pytest.approx(expected, rel=0.2)
+    assert found.steps["b"] == pytest.approx(-0.04, rel=0.2)
+    monkeypatch.setattr(field_directions, "_CURVED", np.inf)
+    wide = check_numbers(made, end, made.initial_values(), FAR)
+    assert wide.errors["b"] < 0.5 * expected
+    assert abs(wide.steps["b"][0]) < 0.02

@@ -1,8 +1,10 @@
-"""Directions of textures and grids whose changes of the pictures approximate those of numbers, by adjoints."""
+"""Differences along numbers that are short enough, and directions of textures and grids whose changes of the pictures approximate those of
+numbers, by adjoints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,8 +29,38 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
+_SHORTENED, _NARROW, _CURVED, _CURVED_ERRORS = 3, 0.25, 0.5, 3.0
+"""Most rounds of shorter differences, and their ratio; relative change of slopes, and errors beyond it, from which they are too long."""
 _LATE, _UNRESOLVED = "the run is too short for this test", "whose share in the pictures is not resolved"
 """Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
+
+
+def narrowed(
+    numbers: Numbers, differences: Differences, key: Key, until: float
+) -> tuple[Differences, np.ndarray | float]:
+    """Return differences along each number with which pictures change in proportion, beyond noise, and limits of these, (n,).
+
+    Long ones reach other parts of the loss, such as where a sun lights another face. Their slopes then tell the distance from the solution,
+    and its error, in a wrong scale. They are not shortened where distance or error would be longer than they are.
+    """
+    residual, short = numbers.residual(numbers.point, key), np.zeros(numbers.count, bool)
+    for index in range(_SHORTENED):
+        if timing.now() > until:
+            break
+        narrow = numbers.differences(_NARROW * differences.directions, key.fold(index))
+        lengths, own = np.diag(differences.directions), np.diag(narrow.directions)  # bounds may cut them
+        ratio = np.divide(own, lengths, out=np.ones_like(own), where=(own > 0.0) & (lengths > 0.0))[:, None, None]
+        halves = ((differences.one, narrow.one), (differences.other, narrow.other))
+        squares, errors = Differences(narrow.directions, *(b / ratio - a for a, b in halves)).squares()
+        along = (narrow.average() * residual).sum(axis=2)
+        far = np.hypot(along.sum(axis=1), np.sqrt(np.square(along).sum(axis=1)))
+        curved = squares > _CURVED**2 * np.maximum(differences.squares()[0], 0.0) + _CURVED_ERRORS * errors
+        curved &= far * ratio[:, 0, 0] < narrow.squares()[0]
+        if not curved.any():
+            break
+        directions, short = np.where(curved, narrow.directions, differences.directions), short | curved
+        differences = replace(differences.moved(narrow, 1.0 * curved), directions=directions)
+    return differences, np.where(short, np.diag(differences.directions), np.inf)
 
 
 def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], dict[str, str]]:

@@ -16,7 +16,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
-from unrender.runs.field_directions import add_field_directions, fields_of
+from unrender.runs.field_directions import add_field_directions, fields_of, narrowed
 from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers, NumbersCheck
 from unrender.runs.reference_distortions import distortions_of_fit
@@ -24,8 +24,8 @@ from unrender.runs.verification import SMOOTH, compares, unexplained_share
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
-_STREAM, _FIELDS = 4, 1 << 16
-"""Stream of all random numbers, and index of those of textures and grids."""
+_STREAM, _FIELDS, _SHORT = 4, 1 << 16, 1 << 17
+"""Stream of all random numbers, and indices of those of textures and grids, and of short differences."""
 _PASSES, _REPEATS, _CHANGES = 3, 8, (64.0, 8.0, 4.0)
 """Passes that find widths, most repeats of the pictures that are judged, and the factors by which widths change at most."""
 _FIRST_WIDTH, _SHIFT = 0.02, 0.3
@@ -85,7 +85,9 @@ def check_numbers(
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
         return NumbersCheck()
-    if (affordable := numbers.affordable(_PASSES + 1, seconds if timing.counts() else math.inf)) is None:
+    limit = seconds if timing.counts() else math.inf
+    affordable = numbers.affordable(_PASSES + 2, limit) or numbers.affordable(_PASSES + 1, limit)  # with `narrowed`
+    if affordable is None:
         return NumbersCheck(unchecked=numbers.keys)
     stated = np.concatenate([np.ravel(known.get(k, np.full(values[k].size, math.inf))) for k in affordable.keys])
     numbers = replace(affordable, weights=weights, ends=ends, settled=stated < _DOUBTFUL * affordable.sizes)
@@ -135,6 +137,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
         zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
+    differences, limits = narrowed(numbers, differences, key.fold(_SHORT), until - 3.0 * longest)
     moved, fixed = fields_of(numbers, sensitivities)
     if moved:
         half = 0.5 * (timing.now() + until)
@@ -143,13 +146,18 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             return NumbersCheck(unchecked=numbers.keys)
         numbers, differences, missing = extended
         fixed |= dict.fromkeys(moved, missing) if missing else {}
-    directions, length = _directions(differences, numbers.limits, change)
+    limits = np.append(np.minimum(limits, numbers.limits[: numbers.count]), numbers.limits[numbers.count :])
+    directions, length = _directions(differences, limits, change)
     for index in range(_ROUNDS):  # short differences hardly tell weak directions from their sums with others
         if length > _WEAK or timing.now() + 4.0 * longest > until:
             break
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
-        directions, length = _directions(again, numbers.limits, change)
-    check = _checked(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
+        directions, length = _directions(again, limits, change)
+    found = _repeated(numbers, directions, key, until - 2.0 * longest)
+    squares, errors = found[0].squares()
+    if (limits < numbers.limits).any() and (squares <= _ERRORS * errors).any():  # noise hides short differences
+        found = _repeated(numbers, _directions(differences, numbers.limits, change)[0], key, until - 2.0 * longest)
+    check = _checked(numbers, _Fit.of(numbers, *found), widths)
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="", blind=()) if fixed else check
 
 
