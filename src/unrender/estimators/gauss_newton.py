@@ -46,8 +46,9 @@ _BLIND = 0.3
 _SETTLED = 0.5  # maximum step, in units of the widths, after which the shift is halved
 _DRIFT = 0.25  # distance, in units of the widths, from which on mean derivative images are of another point
 _MOST_WRONG, _SECANT_ERRORS, _SECANT_KNOWN, _SHARPEST = 0.5, 3.0, 0.2, 1 / 16
-"""Relative error of the predicted change of images from which on differences are too wide; standard errors beyond it; standard error at
-which it is known; least `sharpness`."""
+"""Relative error of the predicted change of images from which on differences are too wide, since a step with it leaves half of the
+distance; standard errors beyond it, which noise exceeds in at most 0.3 % of tests; standard error at which it is known; least
+`sharpness`, at which noise has 16² times the variance."""
 _NARROWER = 0.7  # ratio of a width to the one with which mean derivative images began, below which they begin anew
 
 

@@ -44,7 +44,8 @@ _LEAST_NOISE, _SURPRISE_ERRORS = 1e-6, 6.0
 """Relative eigenvalue of the gradient's noise below which a direction has none, and standard errors of a mean square of 1 that noise may
 reach."""
 _OUTLIER = 100.0
-"""Ratio of a gradient's variance by noise to the mean one from which on it is left out, once at a time: noise may have grown."""
+"""Ratio of a gradient's variance by noise to the mean one from which on it is left out, once at a time: noise may have grown. Weighted by
+its inverse variance it would add at most 1 % to what is known."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
