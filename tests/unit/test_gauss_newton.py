@@ -280,6 +280,17 @@ def test_noise_falls_as_the_root_of_the_steps(settled: float | None) -> None:
     np.testing.assert_allclose(x - MINIMUM, -np.linalg.solve(HESSIAN, weights @ noises), rtol=1e-2, atol=1e-7)
 
 
+@pytest.mark.parametrize(("rate", "short"), [(0.01, True), (0.3, False)])
+def test_steps_on_the_way_to_the_minimum_are_too_few_to_judge(rate: float, short: bool) -> None:
+    """Twelve steps as long as their region allows have no mean of models and no standard error. They ended as finished, without a word."""
+    optimizer = AveragedNewton(learning_rate=rate, trust_radius=1.0)
+    found = ur.optimize(problem(), ur.GaussNewton(4, 4), optimizer, steps=12)
+    assert (max(abs(found.parameters["b"] - TRUTH["b"])) > 0.1) is short
+    line = "12 steps are too few to judge whether a, b converged: give more steps"
+    assert found.warnings == [line] * short
+    assert bool(found.standard_error) is not short
+
+
 @pytest.mark.slow
 def test_standard_errors_cover_the_truth_in_68_percent_of_the_seeds(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any

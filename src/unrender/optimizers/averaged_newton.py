@@ -249,6 +249,10 @@ class AveragedNewton:
         counts = trees.parts(np.where(known, state.counts, np.inf if known.any() else 0.0)[None], parameters)
         return {key: x[0] for key, x in split.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
 
+    def is_short(self, state: AveragedNewtonState) -> bool:
+        """Return whether means have too few models for standard errors. Long steps reduce their number."""
+        return state.scores is not None and bool((state.counts[state.matrix.any(axis=1)] < _FEWEST_MODELS).any())
+
     def _count(self, weight: float) -> float:
         """Return the effective number of models of a mean whose last model has this weight."""
         first, later = ((1.0 + self._growth(count)) * (1.0 / weight - 1.0) + 1.0 for count in (0.0, _FIRST_MODELS))

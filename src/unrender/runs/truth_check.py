@@ -40,14 +40,16 @@ def has_few_steps(steps: int, optimizer: Optimizer) -> bool:
     return steps < (FEW_NEWTON_STEPS if isinstance(optimizer, AveragedNewton) else FEW_STEPS)
 
 
-def with_few_steps(problem: Problem, result: Result) -> Result:
-    """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them."""
+def with_few_steps(problem: Problem, result: Result, short: bool = False) -> Result:
+    """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them. `short` says
+    that they are few whatever their number."""
     unknown = [key for key in problem.unknowns if key not in result.standard_error]
     lines = (*result.warnings, *result.undetermined)
     told = any(
         words in line for words in ("more steps", "more seconds", "of at least", "allows about") for line in lines
     )
-    if result.status != "finished" or told or not unknown or not 0 < result.steps < FEW_NEWTON_STEPS:
+    short = result.steps > 0 and (short or result.steps < FEW_NEWTON_STEPS)
+    if result.status != "finished" or told or not unknown or not short:
         return result
     steps = "1 step is" if result.steps == 1 else f"{result.steps} steps are"
     line = f"{steps} too few to judge whether {listed(unknown)} converged: give more steps"

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import callbacks
 from unrender.runs.budget import seconds_of_steps
 from unrender.runs.callbacks import Callback
@@ -124,7 +125,10 @@ class Verify(Callback):
         started = time.perf_counter()
         with phases.phase(callbacks.VERIFYING), timing.counting(run.seconds is None):
             result = normalised(run.problem, self._verified(run, result))
-        result = with_few_steps(run.problem, result) if run.folder is None else result  # a folder has more tests
+        if run.folder is None:  # a folder has more tests
+            optimizer = run.optimizer
+            short = isinstance(optimizer, AveragedNewton) and optimizer.is_short(run.state.optimizer)
+            result = with_few_steps(run.problem, result, short)
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:
