@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from tiers import quick
 
@@ -408,6 +408,23 @@ def test_only_errors_of_pillow_are_errors_of_the_picture(tmp_path: Path, monkeyp
     monkeypatch.setattr(pictures.images, "orientation", raising)
     with pytest.raises(TypeError, match="a fault of the program"):
         pictures.upright(path, None)
+
+
+def test_colour_profiles_and_exposures_of_photographs_are_told(tmp_path: Path) -> None:
+    """Exposures only where they differ, and are no unknowns."""
+    names = ["a.jpg", "b.jpg", "c.png"]
+    for name, speed in zip(names, (100, 250, 0), strict=True):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: 0.02, 0x829D: 4.0, 0x8827: speed})
+        Image.new("RGB", (8, 6)).save(tmp_path / name, exif=exif)
+    assert pictures.notices([tmp_path / names[0], tmp_path / names[2]], False) == []
+    (line,) = pictures.notices([tmp_path / name for name in names], False)
+    assert line == "exposures differ by a factor of 2.5 by EXIF: recover them, by exposure among --unknowns"
+    assert pictures.notices([tmp_path / name for name in names], True) == []
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", icc_profile=profile)
+    (line,) = pictures.notices([tmp_path / name for name in names], False)
+    assert line.startswith("1 photographs, the first a.jpg: their colour profile is not sRGB")
 
 
 def test_a_photograph_of_a_thousand_scans_is_refused(tmp_path: Path) -> None:

@@ -105,17 +105,16 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
     """
     if not isinstance(source, (str, Path)) or Path(source).suffix.lower() not in (".jpg", ".jpeg", ".png"):
         return ""
-    path, adobe = Path(source), False
+    path = Path(source)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with bounded_files.open_regular(path) as file, Image.open(file, formats=["JPEG", "PNG"]) as picture:
                 if picture.format == "PNG":
                     picture.load()  # EXIF may follow the pixels
-                profile, turned = picture.info.get("icc_profile") or b"", orientation(picture)
-                with contextlib.suppress(Exception):  # EXIF data is often malformed
-                    adobe = picture.getexif().get_ifd(_INTEROPERABILITY).get(1) == "R03"
-                gamma = 1 / _GAMMA if profile or "srgb" in picture.info else picture.info.get("gamma") or 1 / _GAMMA
+                srgb, turned = is_srgb(picture), orientation(picture)
+                declared = {"srgb", "icc_profile"} & picture.info.keys()
+                gamma = (not declared and picture.info.get("gamma")) or 1 / _GAMMA
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
         return ""
     if turned != 1:
@@ -126,8 +125,16 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
         raise InputError(
             f"{path}: it declares a gamma of {gamma:.3g}, that of sRGB is 0.455; convert it to sRGB, or to floating-point .exr"
         )
-    known = not adobe if not profile else any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
-    return "" if known else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
+    return "" if srgb else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
+
+
+def is_srgb(picture: Image.Image) -> bool:
+    """Return whether the colours of a file are sRGB by its profile, or else by EXIF, where R03 is Adobe RGB."""
+    if profile := picture.info.get("icc_profile"):
+        return any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
+    with contextlib.suppress(Exception):  # EXIF data is often malformed, and Pillow raises many types of exceptions
+        return picture.getexif().get_ifd(_INTEROPERABILITY).get(1) != "R03"
+    return True
 
 
 def orientation(picture: Image.Image) -> int:

@@ -263,9 +263,11 @@ def _capture(folder: Path, options: ImportOptions) -> Capture:
 def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tuple[StoredViews, list[str]]:
     with phases.phase("photographs") as advance:
         size = options.resolution, options.scale
-        return prepare(
+        views, told = prepare(
             capture, *size, options.hold_out, lambda done, n: advance(done / n), options.response, masks=masks
         )
+        exposed = "exposure" in (options.unknowns or ())
+        return views, told + pictures.notices([photograph.file for photograph in capture.photographs], exposed)
 
 
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +34,10 @@ _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 1}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
+_EXIF, _EXPOSURE = 0x8769, (0x829A, 0x829D, 0x8827)
+"""EXIF's table of the camera's settings, and its exposure time, f-number and speed (ISO)."""
+_LEAST_RATIO = 1.05
+"""Least ratio of two exposures that is told: a twelfth of a stop."""
 _LONGEST_SIDE = 1 << 15  # exclusive limit of a side in pixels, set by OpenCV's `remap`
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
@@ -72,6 +76,28 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
         return width, height, header.orientation
     height, width = _by_mitsuba(path).values.shape[:2]
     return width, height, 1
+
+
+def notices(files: Sequence[Path], exposed: bool) -> list[str]:
+    """Return a line if colours of some photographs are not sRGB, and, unless their exposures are unknowns (`exposed`), if these differ by
+    EXIF."""
+    others, exposures = list[Path](), list[float]()
+    for path in files:
+        if (header := _header(path)).kind not in _PILLOW_KINDS:
+            continue
+        with _opened(path, header) as picture:
+            others += [] if images.is_srgb(picture) else [path]
+            with suppress(Exception):  # EXIF data is often missing or malformed
+                settings = picture.getexif().get_ifd(_EXIF)
+                time, aperture, speed = (float(settings[tag]) for tag in _EXPOSURE)
+                exposures += [value] if 0 < (value := time * speed / aperture**2) < math.inf else []
+    lines, ratio = list[str](), max(exposures, default=1.0) / min(exposures, default=1.0)
+    if others:
+        what = f"{len(others)} photographs, the first {printable(others[0].name)}: their colour profile is not sRGB and is ignored"
+        lines.append(f"{what}; convert them to sRGB")
+    if ratio > _LEAST_RATIO and not exposed:
+        lines.append(f"exposures differ by a factor of {ratio:.3g} by EXIF: recover them, by exposure among --unknowns")
+    return lines
 
 
 def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
