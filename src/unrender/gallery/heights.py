@@ -35,7 +35,7 @@ class Lenses(fields.Rendered):
 
     One view of the screen; the glass itself is not seen. The unknown is the height in the middle of each lens, (3,), initially the same.
     An expression makes the positions of the pane's vertices a function of it. A higher lens has a shorter focal length, so its caustic
-    is smaller and brighter, or wider beyond the focus.
+    is smaller and brighter, or wider beyond the focus. Heights on both sides of the focus cast nearly the same caustic: a second minimum.
     """
 
     resolution: int = fields.resolution(24)
