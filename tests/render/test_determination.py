@@ -24,7 +24,7 @@ from unrender.runs.result import Result
 from unrender.runs.verification import LOST, fit_status
 
 SIZE = 8
-LIGHT, COLOUR = "lamp.intensity.value", "wall.bsdf.reflectance.value"
+LIGHT, COLOUR, GLOSS = "lamp.intensity.value", "wall.bsdf.reflectance.value", "wall.bsdf.clearcoat_gloss.value"
 
 
 def scene(material: dict[str, Any], **others: Any) -> dict[str, Any]:
@@ -68,6 +68,17 @@ def test_a_parameter_without_influence_is_named_and_others_are_not():
         keys[3]: np.full(1, 0.3),
     }  # least squares know the first one: precise references
     assert undetermined(made, made.initial_values(), 16, errors=errors) == lines[1:]
+
+
+def test_a_parameter_that_another_hides_ends_no_run_of_the_method_that_its_error_advises():
+    """Alone it has no derivative: the error of `auto` advised a method that ended with the same error."""
+    made = problem(scene({"type": "principled", "clearcoat": 0.0, "clearcoat_gloss": 0.5}), GLOSS)
+    with pytest.raises(
+        InputError, match="no picture depends on it, since another parameter, such as a weight of 0, hides it"
+    ):
+        ur.optimize(made, ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=1)
+    assert ur.sensitivity(made) == {}
+    assert [line.partition(":")[0] for line in undetermined(made, made.initial_values(), 16)] == [GLOSS]
 
 
 @pytest.mark.parametrize(

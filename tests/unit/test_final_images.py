@@ -6,7 +6,7 @@ import json
 import math
 import time
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -235,6 +235,21 @@ def test_a_factor_that_least_squares_know_is_not_open(error: float, fits: bool, 
         monkeypatch.setattr(final_images, name, lambda *_: None)
     found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"))
     assert (line in found.undetermined) is open_
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.5, True), (0.1, False)])
+def test_a_number_that_a_long_but_noisy_step_leaves_open_is_told(step: float, told: bool, monkeypatch: Any) -> None:
+    """A sheen ended at 0.26 ± 0.56, where the truth is 0.8, and counted as determined."""
+    made, values = problem(), {"wall": np.full(3, 0.4, np.float32)}
+    noise, steps = {"wall": np.full(3, 0.15)}, {"wall": np.full(3, step)}
+    check = least_squares.NumbersCheck(
+        {}, {}, {"wall": np.full(3, 0.01)}, steps, noise, limits={"wall": np.full(3, 0.25)}
+    )
+    monkeypatch.setattr(final_images, "check_numbers", lambda *_: check)
+    for name in ("_differs", "differs_still"):
+        monkeypatch.setattr(final_images, name, lambda *_: None)
+    found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"))
+    assert any("wall: known to ± 0.5 only" in line for line in found.undetermined) is told
 
 
 def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -747,6 +762,27 @@ def test_noise_of_the_references_is_not_for_a_map_to_explain(
     made = of().replaced(views=[View(exact + noise)])
     values = [(0.5 + progress * (truth - 0.5)).astype(np.float32) for progress in (start, end)]
     assert without_gradient(made, values[0], values[1], monkeypatch) is told
+
+
+@pytest.mark.parametrize(("progress", "told"), [(0.0, True), (0.9, False), (1.0, False)])
+def test_highlights_do_not_hide_that_a_map_without_a_path_gradient_has_explained_nothing_else(
+    progress: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A blend's weight before a mirror that shows a lamp: the lamp's pixels held a third of the fall, all others were as at the start."""
+    own, shown = final_images.render, (np.arange(32) % 8 * 4 + 4, 24 + np.arange(32) // 8 * 4)
+
+    def render(made: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int, **options: Any) -> Any:
+        image = np.array(own(made, values, view, spp, seed, **options))
+        image[shown] += 20.0 * values["map"][0] + np.random.default_rng(seed).standard_normal((32, 1))
+        return image
+
+    monkeypatch.setattr(final_images, "render", render)
+    truth, exact = np.random.default_rng(0).uniform(0.1, 0.9, 50), np.array(half_textured().views[0].reference)
+    exact[shown] += 20.0 * truth[0]
+    end = 0.5 + progress * (truth - 0.5)
+    end[0] = 0.5 + max(progress, 0.4) * (truth[0] - 0.5)
+    lines = lines_without_gradient(half_textured(exact), np.full(50, 0.5), end.astype(np.float32), monkeypatch)
+    assert any("with its initial values, but for its noisiest pixels: " in line for line in lines) is told
 
 
 @pytest.mark.mitsuba

@@ -148,10 +148,13 @@ def curvature(
     most = min(_PROBES, _PROJECTIONS // max(1, sum(squares[key].size for key in maps)))
     made, until = 0, timing.now() + seconds
     while made == 0 or (made < probes and timing.now() < until):
-        one, other = (
-            _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views, noise)
-            for half in range(2)
-        )
+        try:
+            one, other = (
+                _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views, noise)
+                for half in range(2)
+            )
+        except InputError:  # no picture depends on any of the unknowns, as on the gloss of a clear coat of weight 0
+            return Curvature()
         for key, square in squares.items():
             square += one[key][0] * other[key][0]
             if key in noisy:

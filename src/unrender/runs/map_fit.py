@@ -19,9 +19,14 @@ _ERRORS = 2.0
 _EXPLAINED, _OF_MESH, _TO_EXPLAIN = 0.2, 0.9, 0.02
 """Share of the square difference from the references that a map must have explained; that of a mesh, whose vertices may end anywhere while
 its silhouette fits; and smallest difference relative to the picture, with the initial values, of which they must."""
+_NOISY, _BUT, _OTHER = 0.05, ", but for its noisiest pixels", ", or something that is not among the unknowns is wrong"
+"""Share of the noisiest pixels, without which a texture or grid is judged once more; words about these, and about another cause."""
 _BLOCKS, _CHANCE, _APART = (1, 8, 1 << 30), 7.0, 3
 """Number of blocks of equal sign along each axis, for each tested change of a map; number of standard errors that chance does not reach,
 also where the film's filter makes noise of adjacent pixels alike; distance of compared pixels, at which no filter does."""
+
+Pictures = Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]]
+"""Function of values and a view that returns independent pictures (H, W, 3)."""
 
 
 def no_better_maps(
@@ -29,7 +34,7 @@ def no_better_maps(
     result: Result,
     keys: Sequence[str],
     ends: Sequence[Sequence[np.ndarray]],
-    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
+    pictures: Pictures,
 ) -> list[str]:
     """Return a line for each texture, grid or mesh with whose initial values the pictures are nearly as close to the references.
 
@@ -50,30 +55,47 @@ def no_better_maps(
         start, end = (
             Residuals.of(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
         )
-        first, last = start.products, end.products
-        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * start.size**2 * float(start.weights.sum())
-        noise, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
-        share, is_mesh = 1.0 - float(last.sum()) / max(left, 1e-300), key in problem.faces
-        explained = share * left > max(fall, (_OF_MESH if is_mesh else _EXPLAINED) * left)
-        if explained or not left > max(noise, least):
-            continue
-        remains = math.sqrt(max(1.0 - share, 0.0))
-        if is_mesh:
-            may = misfit(end, 0.0, by_pixel=True) is not None
-        else:
-            may = _may_explain(problem, result.parameters, key, end, pictures)
-        if may:
-            closer = "hardly" if share < _EXPLAINED else f"{1.0 - remains:.0%}"
-            lines.append(
-                f"{key}: the final picture is {closer} closer to the references than with its initial values: they hardly determine it, or "
-                f"it needs more steps, or fewer {'vertices' if is_mesh else 'elements'}"
-            )
-        elif is_mesh:
-            lines.append(
-                f"{key}: whether the pictures determine it is not known: the final picture's difference from the references is "
-                f"{remains:.0%} of that with its initial values, and noise hides its cause; use more steps, or more samples per pixel"
-            )
+        line = _line(problem, result, key, start, end, pictures)
+        if not line and key not in problem.faces:
+            line = _line(problem, result, key, *_calm(start, end), pictures, _BUT)
+        lines += filter(None, [line])
     return lines
+
+
+def _line(
+    problem: Problem, result: Result, key: str, start: Residuals, end: Residuals, pictures: Pictures, but: str = ""
+) -> str:
+    """Return the line of `no_better_maps` for one key, "" for none, from the residuals with its initial and final values; `but` are words
+    about pixels that these leave out."""
+    first, last = start.products, end.products
+    left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * start.size**2 * float(start.weights.sum())
+    noise, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
+    share, is_mesh = 1.0 - float(last.sum()) / max(left, 1e-300), key in problem.faces
+    explained = share * left > max(fall, (_OF_MESH if is_mesh else _EXPLAINED) * left)
+    if explained or not left > max(noise, least):
+        return ""
+    remains = math.sqrt(max(1.0 - share, 0.0))
+    if is_mesh or but:
+        may = misfit(end, 0.0, by_pixel=True) is not None
+    else:
+        may = _may_explain(problem, result.parameters, key, end, pictures)
+    if may:
+        closer = "hardly" if share < _EXPLAINED else f"{1.0 - remains:.0%}"
+        return (
+            f"{key}: the final picture is {closer} closer to the references than with its initial values{but}: they hardly determine it, "
+            f"or it needs more steps, or fewer {'vertices' if is_mesh else 'elements'}{_OTHER * bool(but)}"
+        )
+    return is_mesh * (
+        f"{key}: whether the pictures determine it is not known: the final picture's difference from the references is "
+        f"{remains:.0%} of that with its initial values, and noise hides its cause; use more steps, or more samples per pixel"
+    )
+
+
+def _calm(start: Residuals, end: Residuals) -> tuple[Residuals, Residuals]:
+    """Return both without the noisiest pixels: highlights, as of a lamp in a mirror, may hold nearly all of a difference."""
+    noise = sum(np.square(of.halves[0] - of.halves[1]).sum(axis=1) * of.weights for of in (start, end))
+    calm = noise <= np.quantile(noise, 1.0 - _NOISY)
+    return replace(start, weights=start.weights * calm), replace(end, weights=end.weights * calm)
 
 
 def _may_explain(
@@ -81,7 +103,7 @@ def _may_explain(
     values: Mapping[str, np.ndarray],
     key: str,
     residuals: Residuals,
-    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
+    pictures: Pictures,
 ) -> bool:
     """Return whether another map may explain the residuals: pictures change with it as the residuals do, or hardly change at all.
 

@@ -195,7 +195,8 @@ def _naming(keys: Collection[str]) -> Iterator[None]:
             raise
         names = ", ".join(sorted(keys))
         raise InputError(
-            f"parameter {names}: Mitsuba cannot differentiate the image with respect to it; use --method smoothed"
+            f"parameter {names}: no derivative: at the initial values no picture depends on it, since another parameter, such as a weight "
+            "of 0, hides it, or Mitsuba cannot differentiate by it; change that parameter, or use --method smoothed"
         ) from error
 
 
