@@ -377,7 +377,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
         _frame("transform_matrix", [[10**400] * 4] * 3),
         "frames[2]: transform_matrix: expected",
     ),
-    "no matrix": (_frame("transform_matrix", None), "frames[2]: transform_matrix: expected a matrix"),
+    "no matrix": (
+        _frame("transform_matrix", None),
+        "frames[2]: transform_matrix: expected a matrix of 3 x 4 or 4 x 4 numbers, missing",
+    ),
     "NaN": (
         _frame("transform_matrix", [[float("nan")] * 4] * 4),
         "matrix: expected a matrix of finite numbers, got nan",

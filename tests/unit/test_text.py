@@ -138,6 +138,10 @@ def test_suggestions_take_no_time():
     assert time.process_time() - began < 1
 
 
+def test_letters_in_another_order_are_the_nearest_name():
+    assert did_you_mean("wiht", ["weight", "with"]) == "; did you mean with?"
+
+
 def test_long_lists_of_names_are_cut():
     eight = [f"lamp{n}" for n in range(8)]
     assert listed(eight) == ", ".join(eight)

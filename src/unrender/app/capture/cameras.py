@@ -117,7 +117,8 @@ def rigid(matrix: Any, where: str) -> tuple[np.ndarray, float]:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: expected a matrix of numbers") from error
     if array.shape not in ((3, 4), (4, 4)):
-        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 numbers, got shape {array.shape}")
+        got = "missing" if matrix is None else f"got shape {array.shape}"
+        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 numbers, {got}")
     if not np.isfinite(array).all():
         raise InputError(f"{where}: expected a matrix of finite numbers, got {array[~np.isfinite(array)][0]}")
     if len(array) == 4:
