@@ -782,7 +782,7 @@ def test_highlights_do_not_hide_that_a_map_without_a_path_gradient_has_explained
     end = 0.5 + progress * (truth - 0.5)
     end[0] = 0.5 + max(progress, 0.4) * (truth[0] - 0.5)
     lines = lines_without_gradient(half_textured(exact), np.full(50, 0.5), end.astype(np.float32), monkeypatch)
-    assert any("with its initial values, but for its noisiest pixels: " in line for line in lines) is told
+    assert any("with its initial values, but for its brightest pixels: " in line for line in lines) is told
 
 
 @pytest.mark.mitsuba

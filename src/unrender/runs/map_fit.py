@@ -19,8 +19,8 @@ _ERRORS = 2.0
 _EXPLAINED, _OF_MESH, _TO_EXPLAIN = 0.2, 0.9, 0.02
 """Share of the square difference from the references that a map must have explained; that of a mesh, whose vertices may end anywhere while
 its silhouette fits; and smallest difference relative to the picture, with the initial values, of which they must."""
-_NOISY, _BUT, _OTHER = 0.05, ", but for its noisiest pixels", ", or something that is not among the unknowns is wrong"
-"""Share of the noisiest pixels, without which a texture or grid is judged once more; words about these, and about another cause."""
+_BRIGHT, _BUT, _OTHER = 0.05, ", but for its brightest pixels", ", or something that is not among the unknowns is wrong"
+"""Share of the brightest pixels, without which a texture or grid is judged once more; words about these, and about another cause."""
 _BLOCKS, _CHANCE, _APART = (1, 8, 1 << 30), 7.0, 3
 """Number of blocks of equal sign along each axis, for each tested change of a map; number of standard errors that chance does not reach,
 also where the film's filter makes noise of adjacent pixels alike; distance of compared pixels, at which no filter does."""
@@ -57,7 +57,7 @@ def no_better_maps(
         )
         line = _line(problem, result, key, start, end, pictures)
         if not line and key not in problem.faces:
-            line = _line(problem, result, key, *_calm(start, end), pictures, _BUT)
+            line = _line(problem, result, key, *_dimmer(start, end), pictures, _BUT)
         lines += filter(None, [line])
     return lines
 
@@ -91,11 +91,12 @@ def _line(
     )
 
 
-def _calm(start: Residuals, end: Residuals) -> tuple[Residuals, Residuals]:
-    """Return both without the noisiest pixels: highlights, as of a lamp in a mirror, may hold nearly all of a difference."""
-    noise = sum(np.square(of.halves[0] - of.halves[1]).sum(axis=1) * of.weights for of in (start, end))
-    calm = noise <= np.quantile(noise, 1.0 - _NOISY)
-    return replace(start, weights=start.weights * calm), replace(end, weights=end.weights * calm)
+def _dimmer(start: Residuals, end: Residuals) -> tuple[Residuals, Residuals]:
+    """Return both without the brightest pixels: highlights, as of a lamp in a mirror, may hold nearly all of a difference."""
+    bright = sum(np.abs(of.images.mean(axis=0) + of.references).sum(axis=1) * of.weights for of in (start, end))
+    bright += 2.0 * start.references.sum(axis=1) * start.weights
+    dim = bright <= np.quantile(bright, 1.0 - _BRIGHT)
+    return replace(start, weights=start.weights * dim), replace(end, weights=end.weights * dim)
 
 
 def _may_explain(
