@@ -683,14 +683,14 @@ def without_gradient(*given: Any) -> bool:
 
 
 def lines_without_gradient(
-    made: Problem, start: np.ndarray, end: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    made: Problem, start: np.ndarray, end: np.ndarray, monkeypatch: pytest.MonkeyPatch, **options: Any
 ) -> Sequence[str]:
     """Return what a run of a map that is not differentiable is told of undetermined unknowns."""
     monkeypatch.setattr(final_images, "curvature", lambda *_, **__: Curvature())
     monkeypatch.setattr(final_images, "map_keys", lambda problem: list(problem.unknowns))
     initial = {"map": start.astype(np.float32)}
     result = Result({"map": end}, initial, [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
-    return final_images.render_final_images(made, result, 64).undetermined
+    return final_images.render_final_images(made, result, 64, **options).undetermined
 
 
 def patterned() -> Problem:
@@ -783,6 +783,15 @@ def test_highlights_do_not_hide_that_a_map_without_a_path_gradient_has_explained
     end[0] = 0.5 + max(progress, 0.4) * (truth[0] - 0.5)
     lines = lines_without_gradient(half_textured(exact), np.full(50, 0.5), end.astype(np.float32), monkeypatch)
     assert any("with its initial values, but for its brightest pixels: " in line for line in lines) is told
+
+
+def test_a_map_without_a_path_gradient_that_there_is_no_time_to_test_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A blend's weight that ended at its start counted as finished without a word after 40 steps."""
+    line = "whether the pictures determine map: the run is too short for this test"
+    flat = np.full(50, 0.5, np.float32)
+    for left, told in ((0.0, True), (math.inf, False)):
+        of = lines_without_gradient(half_textured(), flat, flat, monkeypatch, left=lambda left=left: left)
+        assert any(line in each for each in of) is told
 
 
 @pytest.mark.mitsuba

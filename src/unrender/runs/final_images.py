@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from unrender.core import phases, timing
-from unrender.core.text import names_in
+from unrender.core.text import listed, names_in
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import LEAST_NUMBERS, MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
 from unrender.runs.determination import (
@@ -158,7 +158,7 @@ def render_final_images(
             end = _Tests(problem, result, weights, left, tests, spent / paths, ends)
             lines, warnings, deviations, unseen = _undetermined(end, known, fits, complete)
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
-            lines += _without_gradient(problem, result, sensitivities, ends, samples) if 3.0 * spent < left() else []
+            lines += _without_gradient(problem, result, sensitivities, ends, samples, 3.0 * spent < left())
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     fits, differs = fits and not differs, differs or still
@@ -330,16 +330,17 @@ def _without_gradient(
     sensitivities: Mapping[str, np.ndarray],
     ends: Sequence[tuple[np.ndarray, ...]],
     spp: int,
+    in_time: bool,
 ) -> list[str]:
     """Return `no_better_maps` of the textures, grids and meshes without a sensitivity, with the random numbers of the result's final
-    images."""
-
-    def halves(values: Mapping[str, np.ndarray], view: int) -> tuple[np.ndarray, ...]:
-        return _picture(problem, values, view, spp, _SEEDS["result"])[0]
-
+    images, or a line that they are not tested."""
     meshes = problem.faces if problem.remeshed_from is None else {}
     keys = [key for key in (*map_keys(problem), *meshes) if key not in sensitivities] if result.steps else []
-    return no_better_maps(problem, result, keys, ends, halves)
+    if keys and not in_time:
+        return [f"whether the pictures determine {listed(keys)}: {TOO_SHORT}"]
+    return no_better_maps(
+        problem, result, keys, ends, lambda values, view: _picture(problem, values, view, spp, _SEEDS["result"])[0]
+    )
 
 
 def _per_pass(problem: Problem, spp: int) -> int | None:
