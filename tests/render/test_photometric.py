@@ -34,11 +34,15 @@ def test_true_normals_and_colours_render_the_photographs(linear: bool, tmp_path:
     (folder / "lights.txt").write_text("\n".join([str(len(rows)), *rows]))
     for index, one in enumerate(values):
         shown = one if linear else srgb(one)
-        Image.fromarray((255 * shown + 0.5).astype(np.uint8)).save(folder / f"{index}.png")
+        exif = Image.Exif()
+        exif[0x010F] = "maker"  # Pillow takes EXIF without it for empty
+        exif.get_ifd(0x8769).update({0x829A: 0.02, 0x829D: 4.0, 0x8827: 100 if index else 250})
+        Image.fromarray((255 * shown + 0.5).astype(np.uint8)).save(folder / f"{index}.png", exif=exif)
 
     found = ur.app.import_capture(folder, tmp_path / "plate", ur.app.ImportOptions(hold_out=0))
     assert (found.kind, found.views, found.held_out, found.size) == ("lights", 6, 0, (WIDTH, HEIGHT))
     assert any("linear" in notice for notice in found.notices) == linear
+    assert any("exposures differ by a factor of 2.5 by EXIF" in notice for notice in found.notices)
     with pytest.raises(ur.InputError, match="overwrite=True"):
         ur.app.import_capture(folder, tmp_path / "plate")
     problem = ur.Problem.from_file(tmp_path / "plate" / "problem.toml")

@@ -86,6 +86,13 @@ def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
         picture.save(tmp_path / f"{name}.png", icc_profile=profile)
     assert images.check_metadata(tmp_path / "sRGB.png") == ""
     assert "LAB.png: its colour profile is not sRGB" in images.check_metadata(tmp_path / "LAB.png")
+    # Neither the name decides, nor the kind of the pixels.
+    named = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    swapped = named.replace(b"rXYZ", b"----").replace(b"gXYZ", b"rXYZ").replace(b"----", b"gXYZ")
+    for profile, srgb in ((named.replace("sRGB".encode("utf-16-be"), bytes(8)), True), (swapped, False)):
+        for mode in ("RGB", "L"):
+            picture.convert(mode).save(tmp_path / "a.png", icc_profile=profile)
+            assert (images.check_metadata(tmp_path / "a.png") == "") is srgb
 
 
 def test_a_gamma_other_than_that_of_srgb_is_refused_in_a_reference_and_not_in_a_mask(tmp_path: Path):
@@ -113,7 +120,8 @@ def test_a_bitmap_is_read_as_its_file(tmp_path: Path):
     rgb, kinds, form = mi.Bitmap(COLOURS), mi.Struct.Type, mi.Bitmap.PixelFormat
     linear = rgb.convert(form.RGB, kinds.UInt8, False)
     xyz: Any = rgb.convert(form.XYZ, kinds.Float32, False)
-    for bitmap_of in (xyz, rgb.convert(form.RGB, kinds.UInt8, True), linear):
+    double = mi.Bitmap(np.array(xyz, np.float64), form.XYZ)
+    for bitmap_of in (xyz, double, rgb.convert(form.RGB, kinds.UInt8, True), linear):
         np.testing.assert_allclose(images.read(bitmap_of).values, COLOURS, atol=0.01)
     assert images.read(linear).notice == ""
     mask = rgb.convert(form.RGB, kinds.UInt8, True)

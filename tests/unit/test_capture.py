@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, PngImagePlugin
 
 from tiers import quick
 
@@ -424,7 +424,18 @@ def test_colour_profiles_and_exposures_of_photographs_are_told(tmp_path: Path) -
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
     Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", icc_profile=profile)
     (line,) = pictures.notices([tmp_path / name for name in names], False)
-    assert line.startswith("1 photographs, the first a.jpg: their colour profile is not sRGB")
+    assert line == "a.jpg: a colour profile that is not sRGB is ignored; convert to sRGB"
+    Image.new("RGB", (8, 6)).save(tmp_path / "b.jpg", icc_profile=profile)
+    assert pictures.notices([tmp_path / name for name in names], False)[0].startswith("a.jpg and 1 more: a colour pro")
+
+
+def test_a_declared_gamma_of_photographs_that_are_decoded_as_srgb_is_told(tmp_path: Path) -> None:
+    info = PngImagePlugin.PngInfo()
+    info.add(b"gAMA", (100_000).to_bytes(4, "big"))
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.png", pnginfo=info)
+    (line,) = pictures.notices([tmp_path / "a.png"], False)
+    assert line == "a.png: a gamma of 1 is declared, that of sRGB is 0.455; give --response 1"
+    assert pictures.notices([tmp_path / "a.png"], False, pictures.LINEAR) == []
 
 
 def test_a_photograph_of_a_thousand_scans_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".
 
 _ORIENTATION, _INTEROPERABILITY = 0x0112, 0xA005
 _GAMMA = 2.2
+_MOST_LEVELS = 8
+"""Largest difference from sRGB of a colour profile that counts as sRGB, of 255 levels: 3 for an exponent of 2.2, 19 for 1.8."""
 OPAQUE = 0.999
 """Least alpha that counts as 1."""
 _COUNTED = "only its opaque pixels count"
@@ -82,7 +85,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
     except (TypeError, ValueError) as error:
         what = f"expected a file or an array, got {type(source).__name__}"
         raise InputError(f"{what}: {reason_of(error, 100)}") from error
-    if is_bitmap(source) and array.dtype in (np.uint8, np.uint16, np.float16, np.float32):
+    if is_bitmap(source) and array.dtype in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
         picture = _of_bitmap(type(source)(source), linearise, alpha)
     else:
         picture = _from_array(array, linearise, alpha, channels)
@@ -113,28 +116,49 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
                 if picture.format == "PNG":
                     picture.load()  # EXIF may follow the pixels
                 srgb, turned = is_srgb(picture), orientation(picture)
-                declared = {"srgb", "icc_profile"} & picture.info.keys()
-                gamma = (not declared and picture.info.get("gamma")) or 1 / _GAMMA
+                gamma = other_gamma(picture)
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
         return ""
     if turned != 1:
         raise InputError(
             f"{path}: its EXIF orientation is {turned}, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
         )
-    if linearised and abs(_GAMMA * gamma - 1) > 0.05:
+    if linearised and gamma:
         raise InputError(
             f"{path}: it declares a gamma of {gamma:.3g}, that of sRGB is 0.455; convert it to sRGB, or to floating-point .exr"
         )
     return "" if srgb else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
 
 
+def other_gamma(picture: Image.Image) -> float:
+    """Return the gamma that a PNG file declares without a colour profile, 0 for none and for that of sRGB within 5 %."""
+    gamma = 0.0 if {"srgb", "icc_profile"} & picture.info.keys() else picture.info.get("gamma", 0.0)
+    return gamma if abs(_GAMMA * gamma - 1) > 0.05 else 0.0
+
+
 def is_srgb(picture: Image.Image) -> bool:
-    """Return whether the colours of a file are sRGB by its profile, or else by EXIF, where R03 is Adobe RGB."""
+    """Return whether the colours of a file are sRGB by its profile, or else by EXIF, where R03 is Adobe RGB.
+
+    Names of profiles do not tell: some of sRGB have others, and "sRGB" is also in those of linear values and of other primaries.
+    """
     if profile := picture.info.get("icc_profile"):
-        return any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
+        with contextlib.suppress(Exception):  # a malformed profile, or one of printers
+            return _is_srgb_profile(profile)
+        return False
     with contextlib.suppress(Exception):  # EXIF data is often malformed, and Pillow raises many types of exceptions
         return picture.getexif().get_ifd(_INTEROPERABILITY).get(1) != "R03"
     return True
+
+
+def _is_srgb_profile(profile: bytes) -> bool:
+    from PIL import ImageCms
+
+    own: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    levels = np.stack(np.meshgrid(*3 * [np.linspace(0, 255, 6, dtype=np.uint8)]), -1).reshape(36, 6, 3)
+    colours = Image.fromarray(levels).convert({"RGB": "RGB", "GRAY": "L"}[own.profile.xcolor_space.strip()])
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    shown: Any = ImageCms.profileToProfile(colours, own, ImageCms.createProfile("sRGB"), intent, "RGB")
+    return np.abs(np.array(shown, np.int16) - np.array(colours.convert("RGB"))).max() <= _MOST_LEVELS
 
 
 def orientation(picture: Image.Image) -> int:

@@ -228,6 +228,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     notices = ["one camera under known lights: recovering normals and colours of a flat plate, without cast shadows"]
     if views.linear:
         notices.append("values are interpreted as linear: a diffuse surface fits them better than sRGB values")
+    notices += pictures.notices(capture.photographs, "exposure" in chosen, pictures.FIT)
     size = views.mask.shape[1], views.mask.shape[0]
     return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
 
@@ -267,7 +268,8 @@ def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tupl
             capture, *size, options.hold_out, lambda done, n: advance(done / n), options.response, masks=masks
         )
         exposed = "exposure" in (options.unknowns or ())
-        return views, told + pictures.notices([photograph.file for photograph in capture.photographs], exposed)
+        photographs = [photograph.file for photograph in capture.photographs]
+        return views, told + pictures.notices(photographs, exposed, options.response)
 
 
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:

@@ -78,23 +78,31 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
     return width, height, 1
 
 
-def notices(files: Sequence[Path], exposed: bool) -> list[str]:
-    """Return a line if colours of some photographs are not sRGB, and, unless their exposures are unknowns (`exposed`), if these differ by
-    EXIF."""
-    others, exposures = list[Path](), list[float]()
+def notices(files: Sequence[Path], exposed: bool, response: str = SRGB) -> list[str]:
+    """Return a line if colours of some photographs are not sRGB, if some are decoded as sRGB and declare another gamma, and, unless their
+    exposures are unknowns (`exposed`), if these differ by EXIF."""
+    others, declared, gamma, exposures = list[str](), list[str](), 0.0, list[float]()
     for path in files:
         if (header := _header(path)).kind not in _PILLOW_KINDS:
             continue
         with _opened(path, header) as picture:
-            others += [] if images.is_srgb(picture) else [path]
+            others += [] if images.is_srgb(picture) else [printable(path.name)]
+            if response == SRGB and (of_file := images.other_gamma(picture)):
+                declared, gamma = [*declared, printable(path.name)], gamma or of_file
             with suppress(Exception):  # EXIF data is often missing or malformed
                 settings = picture.getexif().get_ifd(_EXIF)
                 time, aperture, speed = (float(settings[tag]) for tag in _EXPOSURE)
                 exposures += [value] if 0 < (value := time * speed / aperture**2) < math.inf else []
     lines, ratio = list[str](), max(exposures, default=1.0) / min(exposures, default=1.0)
-    if others:
-        what = f"{len(others)} photographs, the first {printable(others[0].name)}: their colour profile is not sRGB and is ignored"
-        lines.append(f"{what}; convert them to sRGB")
+    for names, what in (
+        (others, "a colour profile that is not sRGB is ignored; convert to sRGB"),
+        (
+            declared,
+            f"a gamma of {gamma:.3g} is declared, that of sRGB is 0.455; give --response {1 / (gamma or 1):.3g}",
+        ),
+    ):
+        if names:
+            lines.append(f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {what}")
     if ratio > _LEAST_RATIO and not exposed:
         lines.append(f"exposures differ by a factor of {ratio:.3g} by EXIF: recover them, by exposure among --unknowns")
     return lines
