@@ -110,11 +110,17 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
     assert reader.read(folder).record.status == "failed"
 
 
-@pytest.mark.parametrize("steps", [3, 20])
-def test_a_short_run_without_a_finite_step_has_failed(steps: int) -> None:
-    result = start(None, steps, optimizer=Exploding(since=0))
+@pytest.mark.parametrize(
+    ("steps", "words"), [(1, "1 step was"), (3, "3 steps in a row were"), (20, "20 steps in a row were")]
+)
+def test_a_short_run_without_a_finite_step_has_failed(steps: int, words: str, tmp_path: Path) -> None:
+    """Resumed with the same budget, it had a second line, of 0 steps in a row."""
+    result = start(tmp_path / "run", steps, optimizer=Exploding(since=0))
     assert (result.status, result.stopped, result.skipped) == ("failed", "non-finite", steps)
-    assert result.warnings[-1].startswith(f"{steps} steps in a row were not finite")
+    assert result.warnings[-1].startswith(f"{words} not finite")
+    parts = {"estimator": ur.PathGradient(spp=2), "optimizer": Exploding(since=0)}
+    again = ur.resume(tmp_path / "run", ur.gallery.problem("exponential"), steps=steps, **parts)
+    assert (again.status, again.warnings) == (result.status, result.warnings)
 
 
 def test_bounds_do_not_hide_a_step_that_is_no_number(tmp_path: Path) -> None:

@@ -351,6 +351,7 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs a finite initial value"),
         ({"initial": "initial = []"}, r"needs a finite initial value: a number"),
         ({"expression": "Sqrt(strength)"}, r"'Sqrt\(strength\)' is not allowed; .*; did you mean sqrt\?$"),
+        ({"expression": "sqrt(x=strength)"}, r"is not allowed; there are .*, \w+$"),
         ({"expression": "strength ^ 2"}, r"is not allowed; .*; a power is \*\*$"),
         ({"initial": 'initial = "nix.npy"'}, r"parameters\[0\].initial: .*nix.npy: no such file"),
         (

@@ -764,16 +764,22 @@ def test_noise_of_the_references_is_not_for_a_map_to_explain(
     assert without_gradient(made, values[0], values[1], monkeypatch) is told
 
 
+@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize(("progress", "told"), [(0.0, True), (0.9, False), (1.0, False)])
 def test_highlights_do_not_hide_that_a_map_without_a_path_gradient_has_explained_nothing_else(
-    progress: float, told: bool, monkeypatch: pytest.MonkeyPatch
+    progress: float, told: bool, masked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A blend's weight before a mirror that shows a lamp: the lamp's pixels held a third of the fall, all others were as at the start."""
-    own, shown = final_images.render, (np.arange(32) % 8 * 4 + 4, 24 + np.arange(32) // 8 * 4)
+    """A blend's weight before a mirror that shows a lamp: the lamp's pixels held a third of the fall, all others were as at the start.
+
+    With a mask of fewer pixels than a twentieth of the picture, none were left without the brightest ones."""
+    count = 4 if masked else 32
+    own, shown = final_images.render, (np.arange(count) % 8 * 4 + 4, 24 + np.arange(count) // 8 * 4)
+    mask = np.full((WIDE, WIDE), 0.0 if masked else 1.0, np.float32)
+    mask[shown] = mask[8:12, :18] = 1.0
 
     def render(made: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int, **options: Any) -> Any:
         image = np.array(own(made, values, view, spp, seed, **options))
-        image[shown] += 20.0 * values["map"][0] + np.random.default_rng(seed).standard_normal((32, 1))
+        image[shown] += 20.0 * values["map"][0] + np.random.default_rng(seed).standard_normal((count, 1))
         return image
 
     monkeypatch.setattr(final_images, "render", render)
@@ -781,7 +787,8 @@ def test_highlights_do_not_hide_that_a_map_without_a_path_gradient_has_explained
     exact[shown] += 20.0 * truth[0]
     end = 0.5 + progress * (truth - 0.5)
     end[0] = 0.5 + max(progress, 0.4) * (truth[0] - 0.5)
-    lines = lines_without_gradient(half_textured(exact), np.full(50, 0.5), end.astype(np.float32), monkeypatch)
+    made = half_textured().replaced(views=[View(exact, mask=mask)])
+    lines = lines_without_gradient(made, np.full(50, 0.5), end.astype(np.float32), monkeypatch)
     assert any("with its initial values, but for its brightest pixels: " in line for line in lines) is told
 
 
@@ -801,7 +808,20 @@ def test_a_map_without_a_path_gradient_whose_loss_takes_no_reference_is_not_comp
     import drjit as dr
 
     made = half_textured().replaced(loss=lambda image: dr.mean(image, axis=None))
-    assert not without_gradient(made, np.full(50, 0.5), np.full(50, 0.5, np.float32), monkeypatch)
+    for left in (0.0, math.inf):  # more time would not test it either
+        flat = np.full(50, 0.5, np.float32)
+        assert not lines_without_gradient(made, flat, flat, monkeypatch, left=lambda left=left: left)
+
+
+def test_pixels_that_the_unknowns_hardly_change_may_be_of_a_single_row() -> None:
+    """Slopes along a side of one pixel ended the run by an exception."""
+    renderer = half_textured().renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    truth = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32)
+    parts = renderer.matrix, renderer.offset.reshape(1, -1, 3)
+    renderer = AnalyticRenderer({"map": truth}, *parts, noise=0.3, grain=0.1, shape=(1, WIDE**2))
+    view = View(0.8 * renderer.exact({"map": truth}))
+    assert told_of(Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], [view]), truth)
 
 
 @pytest.mark.parametrize("count", [4, 10])

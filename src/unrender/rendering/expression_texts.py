@@ -109,10 +109,8 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
                 raise KeyedError(key, f"{name} takes {count} arguments, got {len(args)}")
             parts = [inner(part) for part in args]
             return lambda values: function(*(part(values) for part in parts))
-    hint = (
-        did_you_mean(node.func.id, _FUNCTIONS) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
-    )
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
-        hint = "; a power is **"
+    hint = "; a power is **" if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor) else ""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id not in _FUNCTIONS:
+        hint = did_you_mean(node.func.id, _FUNCTIONS)
     allowed = f"numbers, lists, unknowns, + - * / **, name[0], {', '.join(_FUNCTIONS)}{hint}"
     raise KeyedError(key, f"{ast.unparse(node)!r:.60} is not allowed; there are {allowed}")

@@ -86,10 +86,9 @@ class Budget(Callback):
         if run.stopped in ("steps", "seconds") and 0 < run.step == run.skipped:
             run.stopped = NON_FINITE
         if run.stopped == NON_FINITE:
-            count = run.state.skipped_in_a_row
-            line = (
-                f"{count} steps in a row were not finite: the run was stopped; the result holds the last finite values"
-            )
+            count = run.skipped if run.skipped == run.step else run.state.skipped_in_a_row
+            steps = "1 step was" if count == 1 else f"{count} steps in a row were"
+            line = f"{steps} not finite: the run was stopped; the result holds the last finite values"
             if line not in run.warnings:
                 run.warnings.append(line)
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from unrender.core import phases, timing
-from unrender.core.text import listed, names_in
+from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import LEAST_NUMBERS, MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
 from unrender.runs.determination import (
@@ -333,13 +333,11 @@ def _without_gradient(
     in_time: bool,
 ) -> list[str]:
     """Return `no_better_maps` of the textures, grids and meshes without a sensitivity, with the random numbers of the result's final
-    images, or a line that they are not tested."""
-    meshes = problem.faces if problem.remeshed_from is None else {}
+    images."""
+    meshes, seed = problem.faces if problem.remeshed_from is None else {}, _SEEDS["result"]
     keys = [key for key in (*map_keys(problem), *meshes) if key not in sensitivities] if result.steps else []
-    if keys and not in_time:
-        return [f"whether the pictures determine {listed(keys)}: {TOO_SHORT}"]
     return no_better_maps(
-        problem, result, keys, ends, lambda values, view: _picture(problem, values, view, spp, _SEEDS["result"])[0]
+        problem, result, keys, ends, lambda values, view: _picture(problem, values, view, spp, seed)[0], in_time
     )
 
 

@@ -8,8 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import Residuals
 from unrender.runs.determination import changed
+from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.result import Result
 from unrender.runs.verification import compares, misfit
 from unrender.scene.problem import Problem
@@ -35,6 +37,7 @@ def no_better_maps(
     keys: Sequence[str],
     ends: Sequence[Sequence[np.ndarray]],
     pictures: Pictures,
+    in_time: bool = True,
 ) -> list[str]:
     """Return a line for each texture, grid or mesh with whose initial values the pictures are nearly as close to the references.
 
@@ -47,9 +50,12 @@ def no_better_maps(
         keys: keys of textures, grids and vertices.
         ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
         pictures: function of values and a view that returns such pictures with the same random numbers.
+        in_time: whether there is time for this test; if not, one line says so.
     """
     lines = []
     judged = compares(problem) and result.verification.get("best") == "end" and len(ends[0]) > 1
+    if judged and keys and not in_time:
+        return [f"whether the pictures determine {listed(keys)}: {TOO_SHORT}"]
     for key in keys if judged else ():
         state, views = {**result.parameters, key: result.initial[key]}, range(len(ends))
         start, end = (
@@ -95,7 +101,8 @@ def _dimmer(start: Residuals, end: Residuals) -> tuple[Residuals, Residuals]:
     """Return both without the brightest pixels: highlights, as of a lamp in a mirror, may hold nearly all of a difference."""
     bright = sum(np.abs(of.images.mean(axis=0) + of.references).sum(axis=1) * of.weights for of in (start, end))
     bright += 2.0 * start.references.sum(axis=1) * start.weights
-    dim = bright <= np.quantile(bright, 1.0 - _BRIGHT)
+    counted = (start.weights > 0.0) & (end.weights > 0.0)
+    dim = bright <= (np.quantile(bright[counted], 1.0 - _BRIGHT) if counted.any() else 0.0)
     return replace(start, weights=start.weights * dim), replace(end, weights=end.weights * dim)
 
 

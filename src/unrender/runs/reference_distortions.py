@@ -45,12 +45,14 @@ _MOSTLY, _BRIGHTER = 0.5, 0.15
 
 def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
     """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts: brightness first,
-    distortion by a lens last.
+    distortion by a lens last. A picture of few pixels along a side has none.
 
     Its reference (H, W, 3) may be saturated only where many of its values equal the largest: noise exceeds a single brightest value.
     """
     from scipy.ndimage import gaussian_filter  # takes long to import
 
+    if min(image.shape[:2]) < _LEAST_SIDE:
+        return {}
     down, along = np.gradient(image, axis=(0, 1))
     # Slopes of noise hide distortion by a lens, most of which a field of view explains. Smooth ones tell as much as four times the samples.
     smooth_down, smooth_along = np.gradient(gaussian_filter(image, (_SMOOTH, _SMOOTH, 0.0)), axis=(0, 1))
@@ -94,8 +96,6 @@ def distortions_of_fit(
     mean = after.mean(axis=0)
     sizes = [numbers.problem.sizes[view] for view in numbers.views]
     for view, part, size in zip(numbers.views, slices_of_images(sizes), sizes, strict=True):
-        if min(size) < _LEAST_SIDE:
-            continue
         reference, roots = np.asarray(numbers.problem.views[view].reference, np.float64), numbers.roots(view)
         images = (residuals[:, part] / np.where(roots > 0.0, roots, math.inf)).reshape(2, *size, 3) + reference
         halves = [list(distortions(image, reference).items()) for image in images]
