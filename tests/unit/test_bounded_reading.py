@@ -6,6 +6,7 @@ import io
 import os
 import struct
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,18 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
         image_size.check(tmp_path / "a.jpg")
     (tmp_path / "a.jpg").write_bytes(data + b"\xff\xda\0\2" * 200)  # a video after the picture
     assert image_size.check(tmp_path / "a.jpg") > 0
+
+
+def test_what_follows_a_jpeg_takes_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(image_size, "MOST_VALUES", 1 << 20)
+    (tmp_path / "a.jpg").write_bytes(_noise("JPEG"))
+    os.truncate(tmp_path / "a.jpg", 1 << 26)
+    tracemalloc.start()
+    try:
+        assert image_size.check(tmp_path / "a.jpg") > 0
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("progressive", [False, True])

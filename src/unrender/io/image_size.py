@@ -324,7 +324,8 @@ def _jpeg(_: bytes, file: IO[bytes]) -> Sizes:
     Thumbnails before the picture and videos after it do not count.
     """
     file.seek(0)
-    data, sizes, scans, at = file.read(), list[tuple[int, int, int]](), 0, 2
+    # A picture within the limits has at most about a byte per value, and the file may be of any size.
+    data, sizes, scans, at = file.read(2 * MOST_VALUES), list[tuple[int, int, int]](), 0, 2
     while scans <= _MOST_SCANS and (marker := _JPEG_MARKER.search(data, at)):
         kind, start = marker[0][1], marker.end()
         if kind == _JPEG_END:
