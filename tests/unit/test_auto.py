@@ -17,14 +17,17 @@ from unrender import images, losses, optimizers, pixels
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Hessian, HessianNoise
-from unrender.estimators.derivative_images import cost
+from unrender.estimators.derivative_images import MOST_AVERAGED, cost
+from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.gauss_newton import GaussNewton
+from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.path_then_newton import PathThenNewton
 from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import method
+from unrender.methods.paths import MetaMethod, SamplingOptions
 from unrender.methods.plan import Plan
 from unrender.methods.rules import newton, paths
 from unrender.methods.rules.constants import CONSTANTS
@@ -57,6 +60,15 @@ def problem(loss: Any = None, shares_paths: bool = True, noise: float = 0.3, **o
 def constants(monkeypatch: pytest.MonkeyPatch, **other: Any) -> None:
     """Let `auto` use other numbers."""
     monkeypatch.setattr(module, "CONSTANTS", dataclasses.replace(CONSTANTS, **other))
+
+
+def test_repeated_defaults_are_those_of_the_components() -> None:
+    """Options repeat them, since they are checked without Dr.Jit."""
+    assert (CONSTANTS.averaged_values, CONSTANTS.correlation) == (MOST_AVERAGED, Sobolev().correlation)
+    own = {each.name: each.default for each in dataclasses.fields(MetaEstimator)}
+    for name in ("beta_proportional", "beta_difference"):
+        assert MetaMethod.model_fields[name].default == own[name]
+    assert SamplingOptions.model_fields["emitters"].annotation == EmitterSelection
 
 
 def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:

@@ -154,8 +154,8 @@ def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
         if not stored:
             return *sides, orientation
         raise InputError(
-            f"{path}: its EXIF orientation is {orientation}, and nothing tells whether its camera is that of the turned pixels; save the "
-            "pixels as the camera shows them, without it"
+            f"{path}: its EXIF orientation is {orientation}, and nothing tells whether its camera was calibrated on the stored or the "
+            "turned pixels; remove the orientation for the stored ones, or save the turned ones without it"
         )
     if stored or lens is None:
         return width, height, 1
