@@ -280,15 +280,40 @@ def test_noise_falls_as_the_root_of_the_steps(settled: float | None) -> None:
     np.testing.assert_allclose(x - MINIMUM, -np.linalg.solve(HESSIAN, weights @ noises), rtol=1e-2, atol=1e-7)
 
 
-@pytest.mark.parametrize(("rate", "short"), [(0.01, True), (0.3, False)])
-def test_steps_on_the_way_to_the_minimum_are_too_few_to_judge(rate: float, short: bool) -> None:
-    """Twelve steps as long as their region allows have no mean of models and no standard error. They ended as finished, without a word."""
-    optimizer = AveragedNewton(learning_rate=rate, trust_radius=1.0)
-    found = ur.optimize(problem(), ur.GaussNewton(4, 4), optimizer, steps=12)
+@pytest.mark.parametrize(
+    ("rate", "radius", "steps", "short"),
+    [(0.01, 1.0, 12, True), (0.3, 1.0, 12, False), (1.0, 0.01, 40, True)],
+)
+def test_steps_on_the_way_to_the_minimum_are_too_few_to_judge(
+    rate: float, radius: float, steps: int, short: bool
+) -> None:
+    """Steps as long as their region allows have no mean of models, or one whose minimum they have not reached, and no standard error.
+    They ended as finished, without a word."""
+    optimizer = AveragedNewton(learning_rate=rate, trust_radius=radius)
+    found = ur.optimize(problem(), ur.GaussNewton(4, 4), optimizer, steps=steps)
     assert bool(abs(found.parameters["b"] - TRUTH["b"]).max() > 0.1) is short
-    line = "12 steps are too few to judge whether a, b converged: give more steps"
+    line = f"{steps} steps are too few to judge whether a, b converged: give more steps"
     assert found.warnings == [line] * short
     assert bool(found.standard_error) is not short
+
+
+@pytest.mark.parametrize(("errors", "radius", "told"), [(0.5, 1.0, "xy"), (2.0, 1.0, "y"), (2.0, 3.0, "xy")])
+def test_only_numbers_that_the_trust_region_holds_away_from_the_minimum_have_no_standard_error(
+    errors: float, radius: float, told: str
+) -> None:
+    """A point some standard errors away from the mean's minimum, after a step of length 1 in a region of this radius."""
+    optimizer, tree = AveragedNewton(), {"x": MINIMUM[:2], "y": MINIMUM[2:]}
+    state, rng = optimizer.init(tree), np.random.default_rng(0)
+    for noise in 1e-3 * rng.normal(size=(20, 3)):
+        parts = Hessian(HESSIAN), ScoreCovariance(np.zeros((3, 3)))
+        _, state = optimizer.update(Estimate(0.0, {"x": noise[:2], "y": noise[2:]}, parts), state, tree)
+    minimum = np.linalg.solve(state.matrix, state.target)
+    tree = {"x": minimum[:2], "y": minimum[2:]}
+    known = optimizer.standard_errors(state, tree)
+    away = {"x": minimum[:2] + np.array([errors * known["x"][0], 0.0]), "y": minimum[2:]}
+    held = replace(state, lengths=np.ones(3), radii=np.full(3, radius))
+    assert "".join(optimizer.standard_errors(held, away)) == told
+    assert optimizer.is_short(held, away) is ("x" not in told)
 
 
 @pytest.mark.slow

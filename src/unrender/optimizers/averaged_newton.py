@@ -172,9 +172,7 @@ class AveragedNewton:
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             return trees.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
-        added, fluctuation, scores = (
-            _finite(estimate.get(kind)) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
-        )
+        added, fluctuation, scores = (_finite(estimate.get(x)) for x in (HessianNoise, GradientNoise, ScoreCovariance))
         added, fluctuation = (np.zeros_like(hessian) if x is None else x for x in (added, fluctuation))
         scale = coordinate_scales(estimate, state, parameters, self.learning_rate)
         reaches = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
@@ -229,11 +227,24 @@ class AveragedNewton:
 
         They cover the noise of the run and of the references, not the bias of finite differences. They are infinite for elements that
         change no image, and for those with a share in a damped direction, which the images hardly determine. {} if the last estimate has
-        no `ScoreCovariance`. Parameters with fewer than 8 effective models, or with models without noise, are omitted.
+        no `ScoreCovariance`. Parameters with fewer than 8 effective models, with models without noise, or still on the way to A⁻¹ b in a
+        trust region that limits their steps, are omitted.
         """
-        if state.scores is None:
-            return {}
-        errors = np.full(len(state.matrix), np.inf)
+        errors, counts = (trees.parts(x[None], parameters) for x in self._errors(state, parameters))
+        return {key: x[0] for key, x in errors.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
+
+    def is_short(self, state: AveragedNewtonState, parameters: Tree) -> bool:
+        """Return whether means have too few models for standard errors. Long steps and steps that the trust region cuts leave few."""
+        return bool((self._errors(state, parameters)[1] < _FEWEST_MODELS).any())
+
+    def _errors(self, state: AveragedNewtonState, parameters: Tree) -> tuple[np.ndarray, np.ndarray]:
+        """Return the standard errors of A⁻¹ b, 0 if they are unknown, and the effective number of models, (n,) each. That is 0 for blocks
+        that the trust region holds more than a standard error away from A⁻¹ b."""
+        known = state.matrix.any(axis=1)  # the others are in no model
+        if state.scores is None or not known.any():
+            return np.zeros(known.size), np.full(known.size, np.inf)
+        x, errors, counts = trees.ravel(parameters), np.full(known.size, np.inf), np.where(known, state.counts, np.inf)
+        held = (state.radii > 0.0) & (state.lengths >= _USED * state.radii)
         for block in _blocks(state.matrix != 0.0):
             both = np.ix_(block, block)
             if not np.diag(state.matrix[both]).all():
@@ -244,14 +255,10 @@ class AveragedNewton:
             middle = state.scatter[both] + positive_part(state.scores[both])
             error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))
             errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.inf, error)
-        split = trees.parts(errors[None], parameters)
-        known = state.matrix.any(axis=1)  # the others are in no model
-        counts = trees.parts(np.where(known, state.counts, np.inf if known.any() else 0.0)[None], parameters)
-        return {key: x[0] for key, x in split.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
-
-    def is_short(self, state: AveragedNewtonState) -> bool:
-        """Return whether means have too few models for standard errors. Long steps reduce their number."""
-        return state.scores is not None and bool((state.counts[state.matrix.any(axis=1)] < _FEWEST_MODELS).any())
+            away = np.abs(inverse @ (state.matrix[both] @ x[block] - state.target[block]))
+            if held[block].any() and (away > errors[block]).any():
+                counts[block] = 0.0
+        return errors, counts
 
     def _count(self, weight: float) -> float:
         """Return the effective number of models of a mean whose last model has this weight."""
@@ -260,8 +267,7 @@ class AveragedNewton:
 
     def _growth(self, count: float) -> float:
         """Return the power of their number with which the weights of models grow."""
-        settled = self.settled_averaging
-        return self.averaging if settled is None or count < _FIRST_MODELS else settled
+        return self.averaging if self.settled_averaging is None or count < _FIRST_MODELS else self.settled_averaging
 
     def _radius(self, radius: float, step: np.ndarray, gradient: np.ndarray) -> float:
         """Return the next radius of a block's trust region, from the gradient at the end of its last step.

@@ -126,8 +126,8 @@ class Verify(Callback):
         with phases.phase(callbacks.VERIFYING), timing.counting(run.seconds is None):
             result = normalised(run.problem, self._verified(run, result))
         if run.folder is None:  # a folder has more tests
-            optimizer = run.optimizer
-            short = isinstance(optimizer, AveragedNewton) and optimizer.is_short(run.state.optimizer)
+            newton, of = run.optimizer, run.problem.coordinates.of
+            short = isinstance(newton, AveragedNewton) and newton.is_short(run.state.optimizer, of(run.parameters))
             result = with_few_steps(run.problem, result, short)
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
