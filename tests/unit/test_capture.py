@@ -429,6 +429,11 @@ def test_colour_profiles_and_exposures_of_photographs_are_told(tmp_path: Path) -
     assert line == "a.jpg: a colour profile that is not sRGB is ignored; convert to sRGB"
     Image.new("RGB", (8, 6)).save(tmp_path / "b.jpg", icc_profile=profile)
     assert pictures.notices([tmp_path / name for name in names], False)[0].startswith("a.jpg and 1 more: a colour pro")
+    # Pillow opens no TIFF files of 16 bits in RGB.
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.tif", icc_profile=profile)
+    Image.new("I;16", (8, 6)).save(tmp_path / "b.tif", icc_profile=profile)
+    (line,) = pictures.notices([tmp_path / "a.tif", tmp_path / "b.tif"], False)
+    assert line.startswith("a.tif and 1 more: a colour profile")
 
 
 def test_a_declared_gamma_of_photographs_that_are_decoded_as_srgb_is_told(tmp_path: Path) -> None:

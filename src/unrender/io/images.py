@@ -115,7 +115,7 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
             with bounded_files.open_regular(path) as file, Image.open(file, formats=["JPEG", "PNG"]) as picture:
                 if picture.format == "PNG":
                     picture.load()  # EXIF may follow the pixels
-                srgb, turned = is_srgb(picture), orientation(picture)
+                srgb, turned = is_srgb(picture.info.get("icc_profile"), exif_of(picture)), orientation(picture)
                 gamma = other_gamma(picture)
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
         return ""
@@ -136,18 +136,25 @@ def other_gamma(picture: Image.Image) -> float:
     return gamma if abs(_GAMMA * gamma - 1) > 0.05 else 0.0
 
 
-def is_srgb(picture: Image.Image) -> bool:
+def is_srgb(profile: bytes | None, exif: Image.Exif) -> bool:
     """Return whether the colours of a file are sRGB by its profile, or else by EXIF, where R03 is Adobe RGB.
 
     Names of profiles do not tell: some of sRGB have others, and "sRGB" is also in those of linear values and of other primaries.
     """
-    if profile := picture.info.get("icc_profile"):
+    if profile:
         with contextlib.suppress(Exception):  # a malformed profile, or one of printers
             return _is_srgb_profile(profile)
         return False
     with contextlib.suppress(Exception):  # EXIF data is often malformed, and Pillow raises many types of exceptions
-        return picture.getexif().get_ifd(_INTEROPERABILITY).get(1) != "R03"
+        return exif.get_ifd(_INTEROPERABILITY).get(1) != "R03"
     return True
+
+
+def exif_of(picture: Image.Image) -> Image.Exif:
+    """Return EXIF data, empty if they are malformed: Pillow raises many types of exceptions."""
+    with contextlib.suppress(Exception):
+        return picture.getexif()
+    return Image.Exif()
 
 
 def _is_srgb_profile(profile: bytes) -> bool:
@@ -163,10 +170,8 @@ def _is_srgb_profile(profile: bytes) -> bool:
 
 def orientation(picture: Image.Image) -> int:
     """Return EXIF's orientation, 1 if it is absent or unreadable."""
-    try:
-        return int(picture.getexif().get(_ORIENTATION, 1))
-    except Exception:  # EXIF data is often malformed, and Pillow raises many types of exceptions
-        return 1
+    value = exif_of(picture).get(_ORIENTATION, 1)
+    return value if isinstance(value, int) else 1
 
 
 def write(picture: Any, path: Path, half: bool = False) -> None:

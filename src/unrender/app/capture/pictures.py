@@ -34,8 +34,8 @@ _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 1}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
-_EXIF, _EXPOSURE = 0x8769, (0x829A, 0x829D, 0x8827)
-"""EXIF's table of the camera's settings, and its exposure time, f-number and speed (ISO)."""
+_PROFILE, _EXIF, _EXPOSURE = 0x8773, 0x8769, (0x829A, 0x829D, 0x8827)
+"""TIFF's colour profile, EXIF's table of the camera's settings, and its exposure time, f-number and speed (ISO)."""
 _LEAST_RATIO = 1.05
 """Least ratio of two exposures that is told: a twelfth of a stop."""
 _LONGEST_SIDE = 1 << 15  # exclusive limit of a side in pixels, set by OpenCV's `remap`
@@ -83,14 +83,12 @@ def notices(files: Sequence[Path], exposed: bool, response: str = SRGB) -> list[
     exposures are unknowns (`exposed`), if these differ by EXIF."""
     others, declared, gamma, exposures = list[str](), list[str](), 0.0, list[float]()
     for path in files:
-        if (header := _header(path)).kind not in _PILLOW_KINDS:
-            continue
-        with _opened(path, header) as picture:
-            others += [] if images.is_srgb(picture) else [printable(path.name)]
-            if response == SRGB and (of_file := images.other_gamma(picture)):
+        with _tags(path) as (exif, profile, of_file):
+            others += [] if images.is_srgb(profile, exif) else [printable(path.name)]
+            if response == SRGB and of_file:
                 declared, gamma = [*declared, printable(path.name)], gamma or of_file
             with suppress(Exception):  # EXIF data is often missing or malformed
-                settings = picture.getexif().get_ifd(_EXIF)
+                settings = exif.get_ifd(_EXIF)
                 time, aperture, speed = (float(settings[tag]) for tag in _EXPOSURE)
                 exposures += [value] if 0 < (value := time * speed / aperture**2) < math.inf else []
     lines, ratio = list[str](), max(exposures, default=1.0) / min(exposures, default=1.0)
@@ -106,6 +104,21 @@ def notices(files: Sequence[Path], exposed: bool, response: str = SRGB) -> list[
     if ratio > _LEAST_RATIO and not exposed:
         lines.append(f"exposures differ by a factor of {ratio:.3g} by EXIF: recover them, by exposure among --unknowns")
     return lines
+
+
+@contextmanager
+def _tags(path: Path) -> Iterator[tuple[Image.Exif, bytes | None, float]]:
+    """Yield a file's EXIF data, its colour profile, and its gamma if that is not sRGB's. Pillow opens no TIFF files of 16 bits in RGB."""
+    if (header := _header(path)).kind in _PILLOW_KINDS:
+        with _opened(path, header) as picture:
+            yield images.exif_of(picture), picture.info.get("icc_profile"), images.other_gamma(picture)
+        return
+    with bounded_files.open_regular(path) as file:
+        exif = Image.Exif()
+        with suppress(Exception):
+            if header.kind == "TIFF":
+                exif.load_from_fp(file)
+        yield exif, exif.get(_PROFILE), 0.0
 
 
 def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
