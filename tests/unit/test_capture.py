@@ -421,7 +421,7 @@ def test_colour_profiles_and_exposures_of_photographs_are_told(tmp_path: Path) -
         Image.new("RGB", (8, 6)).save(tmp_path / name, exif=exif)
     assert pictures.notices([tmp_path / names[0], tmp_path / names[2]], False) == []
     (line,) = pictures.notices([tmp_path / name for name in names], False)
-    assert line == "exposures differ by a factor of 2.5 by EXIF: recover them, by exposure among --unknowns"
+    assert line == "exposures differ by a factor of 2.5 by EXIF: list exposure among --unknowns to recover them"
     assert pictures.notices([tmp_path / name for name in names], True) == []
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
     Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", icc_profile=profile)

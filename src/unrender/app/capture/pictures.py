@@ -102,7 +102,9 @@ def notices(files: Sequence[Path], exposed: bool, response: str = SRGB) -> list[
         if names:
             lines.append(f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {what}")
     if ratio > _LEAST_RATIO and not exposed:
-        lines.append(f"exposures differ by a factor of {ratio:.3g} by EXIF: recover them, by exposure among --unknowns")
+        lines.append(
+            f"exposures differ by a factor of {ratio:.3g} by EXIF: list exposure among --unknowns to recover them"
+        )
     return lines
 
 
