@@ -107,7 +107,8 @@ def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):
         (sensitivity, {"probes": 0}, "probes must be a whole number of at least 1"),
         (sensitivity, {"views": 0}, "views must be a whole number of at least 1, got 0"),
         (uncertainty, {"values": None}, r"parameters: expected \['wall'\], got \[\]"),
-        (uncertainty, {"values": {"wall": np.full(TEXTURE, np.nan)}}, "parameter wall: expected finite values"),
+        (uncertainty, {"values": {"wall": np.full(TEXTURE, np.nan)}}, "parameter wall: expected finite numbers"),
+        (uncertainty, {"values": {"wall": np.full(TEXTURE, "0.5")}}, "parameter wall: expected finite numbers"),
     ],
 )
 def test_refuses_what_makes_no_sense(function: Any, given: dict[str, Any], message: str):

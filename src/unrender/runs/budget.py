@@ -227,14 +227,14 @@ def few_steps(
     if steps >= min(needed, most or needed):
         return ""
     ways = ["use more seconds" if enough is None else f"use at least {max(math.ceil(enough), 1)} seconds"]
-    if compiled and enough is not None and enough <= seconds:
-        ways = ["run it again, with the kernels that are now compiled"]
     if spp is not None and spp > _LEAST_SPP:
         ways.append(f"fewer samples (--set spp={max(spp // 4, _LEAST_SPP)})")
     ways.append("a smaller picture (resolution)")
     if large:
         ways.append("fewer pixels a step (--set pixels={} --set spp={})".format(*CONSTANTS.short_batch))
     advice = ", ".join(ways[:-1]) + (", or " if len(ways) > 2 else " or ") + ways[-1]
+    if compiled and enough is not None and enough <= seconds:
+        advice = "run it again, since its kernels are now compiled"
     late = f" after {before:.0f} s of loading and compiling" if before > _LONG_BEFORE * seconds else ""
     return f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}{late}; {advice}"
 

@@ -126,8 +126,8 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
-        if not np.isfinite(value).all():
-            raise InputError(f"parameter {key}: expected finite values, got NaN or infinite ones")
+        if np.asarray(value).dtype.kind in "OSUc" or not np.isfinite(value).all():
+            raise InputError(f"parameter {key}: expected finite numbers, got NaN, infinite ones or another type")
     return {key: problem.renderer.array(np.asarray(parameters[key])) for key in point}
 
 
