@@ -126,6 +126,27 @@ def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(
     np.testing.assert_allclose(first(plan)["place"], start)
 
 
+@pytest.mark.parametrize(
+    ("start", "traits", "moved"),
+    [
+        ([0.0, 0.0], {}, True),
+        ([0.0, 0.5], {}, False),
+        ([0.0, 0.0], {"scattering": "medium"}, False),
+        ([0.0, 0.0], {"brightness": "reflectance"}, False),
+    ],
+)
+def test_numbers_at_their_only_bound_start_above_it(
+    start: list[float], traits: dict[str, Any], moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures are even functions of some, such as k of a metal, so their derivatives there are 0."""
+    limits = {"nonlinear": False, **traits, "lowest": 0.0}
+    brightness = limits.pop("brightness", "light")
+    plan = method("auto").plan(problem(monkeypatch, start, (0.0, None), brightness=brightness, **limits))
+    assert any(reason.startswith("starts at other values of place") for reason in plan.reasons) is moved
+    assert (np.abs(first(plan)["place"] - 2.5) <= 2.5).all()
+    assert np.array_equal(first(plan)["place"], start) is not moved
+
+
 def test_a_start_whose_difference_is_noise_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     made = problem(monkeypatch, [2.0, 7.0])
     changes = iter([-1e-9, *[-1e-6] * 1000])

@@ -104,6 +104,8 @@ class AutoMethod(Options):
         plan = next(plan for rule in paths.RULES if (plan := rule(known)) is not None)
         plan = replace(plan, reasons=(*plan.reasons, *known.notes, *starts.exchangeable(known)))
         few = known.elements <= CONSTANTS.few_numbers
+        if few and any(starts.starts_at_bound(problem, key) for key in known.infos):
+            plan = starts.best_start(known, list(known.infos), plan)
         plan = replace(plan, other_starts=tuple(starts.varied_keys(problem, list(known.infos)))) if few else plan
         shorter = self._shorter(plan, 0.0)
         return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan

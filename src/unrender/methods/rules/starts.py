@@ -27,6 +27,7 @@ _PER_DIMENSION, _MOST_PLACES, _MOST_POSES = 16, 24, 48
 """Number of compared places per dimension, and maximum number in all dimensions together; the latter for the pose of a shape."""
 _NEAR = 16  # number of places around the best pose of a shape
 _FAR = 4.0  # largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)
+_OPEN = 5.0  # places above the only bound of numbers that start at it; k of most metals is at most 5 in the visible range
 _PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
@@ -301,6 +302,14 @@ def number_of_places(problem: Problem, keys: Sequence[str]) -> int:
     return sum(len(_points(problem, group)) + _NEAR * _is_shape(problem, group[0]) for group in groups)
 
 
+def starts_at_bound(problem: Problem, key: str) -> bool:
+    """Return whether all values of an unknown that is no pose, brightness or density start at its only bound, a lower one."""
+    unknown, info = problem.unknowns[key], problem.renderer.parameters()[key]
+    low, high = unknown.bounds
+    other = info.rigid or info.viewpoint or info.brightness or info.scattering == "medium"
+    return not other and low is not None and high is None and bool((unknown.initial == low).all())
+
+
 def _dimensions(problem: Problem, key: str) -> int:
     """Return the number of dimensions in which places of an unknown are compared; 0 for none."""
     info, unknown = problem.renderer.parameters()[key], problem.unknowns[key]
@@ -308,7 +317,7 @@ def _dimensions(problem: Problem, key: str) -> int:
         return 0
     if info.role == "direction":
         return 2 if unknown.shape() == (3,) else 0
-    formed = not info.viewpoint if info.rigid else info.nonlinear or info.scattering
+    formed = not info.viewpoint if info.rigid else info.nonlinear or info.scattering or starts_at_bound(problem, key)
     return unknown.initial.size if formed and None not in _range(problem, key, 0.0) else 0
 
 
@@ -330,8 +339,15 @@ def _owner(key: str) -> str:
 
 
 def _range(problem: Problem, key: str, value: float) -> Bounds:
-    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value."""
+    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value.
+
+    Numbers that start at their only bound, a lower one, have a range above it: there a picture may hardly change, as by k = 0 of a metal, of
+    which it is an even function.
+    """
     bounds, info = problem.unknowns[key].bounds, problem.renderer.parameters()[key]
+    if starts_at_bound(problem, key):
+        low = ends_of(bounds)[0]
+        return low, low + _OPEN
     if bounds != (None, None) or not info.rigid:
         return bounds
     if info.angle:
