@@ -27,7 +27,7 @@ _PER_DIMENSION, _MOST_PLACES, _MOST_POSES = 16, 24, 48
 """Number of compared places per dimension, and maximum number in all dimensions together; the latter for the pose of a shape."""
 _NEAR = 16  # number of places around the best pose of a shape
 _FAR = 4.0  # largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)
-_OPEN = 5.0  # places above the only bound of numbers that start at it; k of most metals is at most 5 in the visible range
+_OPEN = 5.0  # range of places above the only bound of numbers that start at it; k of most metals is below 5
 _PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
@@ -341,8 +341,8 @@ def _owner(key: str) -> str:
 def _range(problem: Problem, key: str, value: float) -> Bounds:
     """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value.
 
-    Numbers that start at their only bound, a lower one, have a range above it: there a picture may hardly change, as by k = 0 of a metal, of
-    which it is an even function.
+    Numbers that start at their only bound, a lower one, have a range above it. Pictures may hardly change there: those of a metal are even
+    functions of k.
     """
     bounds, info = problem.unknowns[key].bounds, problem.renderer.parameters()[key]
     if starts_at_bound(problem, key):
