@@ -50,7 +50,7 @@ def test_a_metal_that_starts_without_absorption_gets_its_own() -> None:
     made = ur.Problem(
         scene, [ur.Parameter("ball.bsdf.k.value", initial=0.0)], [ur.View(np.zeros((SIZE, SIZE, 3)))], max_depth=3
     )
-    reference = ur.render(made, {"ball.bsdf.k.value": truth}, 0, spp=1024, seed=9)
+    reference = ur.render(made, {"ball.bsdf.k.value": np.array(truth)}, 0, spp=1024, seed=9)
     result = ur.optimize(made.replaced(views=[ur.View(reference)]), steps=24, progress=False)
     assert np.abs(result.parameters["ball.bsdf.k.value"] - truth).max() < 0.5, result.parameters
 
