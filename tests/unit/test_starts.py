@@ -13,7 +13,7 @@ from tests.analytic import AnalyticRenderer
 from unrender import losses
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import starts
+from unrender.methods.rules import exchangeable, starts
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.paths import start_factors
 from unrender.runs.optimize import optimize
@@ -311,4 +311,4 @@ def test_lights_that_may_be_exchanged_have_a_line(
     first = Parameter(other.replace("fill", "lamp"), bounds=(1.0, 3.0), initial=2.0)
     unknown = [first if "position" in other else Parameter("lamp.rotation.x"), Parameter(other, bounds=bounds)]
     scene = Problem(renderer, unknown, [View(np.zeros((4, 4, 3)))])
-    assert starts.exchangeable_lights(scene) == (["lamp", "fill"] if told else [])
+    assert exchangeable.exchangeable_lights(scene) == (["lamp", "fill"] if told else [])

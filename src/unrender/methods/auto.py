@@ -19,12 +19,13 @@ from unrender.methods.smoothed import SIGMA_HELP
 if TYPE_CHECKING:
     from unrender.estimators.base import Estimator
     from unrender.methods.plan import Plan
-    from unrender.methods.rules import paths, starts, traits
+    from unrender.methods.rules import exchangeable, paths, starts, traits
     from unrender.optimizers.base import Optimizer
     from unrender.scene import render
     from unrender.scene.problem import Problem
 else:  # options are checked without Dr.Jit
-    paths, starts, traits = lazy.modules("methods.rules.paths", "methods.rules.starts", "methods.rules.traits")
+    exchangeable, paths = lazy.modules("methods.rules.exchangeable", "methods.rules.paths")
+    starts, traits = lazy.modules("methods.rules.starts", "methods.rules.traits")
     render = lazy.Module("scene.render")
 
 
@@ -102,7 +103,7 @@ class AutoMethod(Options):
     def plan(self, problem: Problem) -> Plan:
         known = traits.Traits(problem, self, CONSTANTS)
         plan = next(plan for rule in paths.RULES if (plan := rule(known)) is not None)
-        plan = replace(plan, reasons=(*plan.reasons, *known.notes, *starts.exchangeable(known)))
+        plan = replace(plan, reasons=(*plan.reasons, *known.notes, *exchangeable.exchangeable(known)))
         few = known.elements <= CONSTANTS.few_numbers
         if few and any(starts.starts_at_bound(problem, key) for key in known.infos):
             plan = starts.best_start(known, list(known.infos), plan)

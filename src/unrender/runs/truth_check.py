@@ -11,7 +11,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.methods.rules.starts import exchangeable_pairs
+from unrender.methods.rules.exchangeable import exchangeable_pairs
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, root_of_covariance, seen_cells

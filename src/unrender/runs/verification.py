@@ -14,7 +14,7 @@ from unrender.core.trees import Tree
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, Residuals
 from unrender.losses import FunctionLoss
-from unrender.methods.rules.starts import exchangeable_lights
+from unrender.methods.rules.exchangeable import exchangeable_lights
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem

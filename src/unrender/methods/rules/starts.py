@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods.base import measure
 from unrender.methods.plan import Plan
+from unrender.methods.rules.exchangeable import owner
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations import Bounds
-from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.bounds import ends_of
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.problem import Problem
@@ -31,12 +30,6 @@ _OPEN = 5.0  # range of places above the only bound of numbers that start at it;
 _PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
-_MOTIONS = ("translation", "rotation", "scale")
-"""Parts of the keys of poses, after the name of what they move."""
-_POSITION = "position"  # last part of the keys of positions of lights without a pose
-_NORMALS, _TRANSFORM, _ROUNDING = "_normals", "to_", 1e-4
-"""Last part of the keys of normals, and its beginning for transforms, which are not compared; largest difference of equal positions,
-relative to a shape's size."""
 _FACTORS = (1e-2, 1e2)  # limits of the common factor of lights in a comparison, within their bounds
 
 
@@ -87,75 +80,6 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
         f"starts at other values of {listed(varied)}, where the loss is {place.share:.0%} of that at the initial values"
     )
     return replace(plan, settings={**plan.settings, **settings}, reasons=(*plan.reasons, reason))
-
-
-def exchangeable(traits: Traits) -> list[str]:
-    """Return a line about lights or shapes that may end in each other's place; [] for none.
-
-    The loss there may exceed that of the truth by less than noise, so pictures of other starts do not tell (`shapes.lights`).
-    """
-    place = "may end in each other's place, where the picture is nearly the same; the start decides"
-    alike = _names(exchangeable_pairs(traits.problem, shapes=True))
-    return [f"{listed(alike)} {place}"] if alike else []
-
-
-def exchangeable_lights(problem: Problem) -> list[str]:
-    """Return the names of lights that another light of the same kind equals but for the unknown coordinates of its pose or position."""
-    return _names(exchangeable_pairs(problem))
-
-
-def exchangeable_pairs(problem: Problem, shapes: bool = False) -> list[tuple[str, str]]:
-    """Return the pairs of the names of such lights; with `shapes`, also shapes of equal form and material at unknown places."""
-    infos = problem.renderer.parameters()
-    moved: dict[str, set[str]] = {}
-    for key in problem.shapes():
-        if (name := _moved(infos, key, shapes)) is not None:
-            moved.setdefault(name, set()).add(key.removeprefix(name))
-    return [pair for pair in combinations(moved, 2) if _alike(problem, *pair, moved)]
-
-
-def _names(pairs: Sequence[tuple[str, str]]) -> list[str]:
-    return list(dict.fromkeys(name for pair in pairs for name in pair))
-
-
-def _moved(infos: Mapping[str, ParameterInfo], key: str, shapes: bool) -> str | None:
-    """Return the name of the light, or shape, that a parameter moves; None for others."""
-    if infos[key].rigid:
-        return _owner(key) if infos[key].light or (shapes and infos[key].shape_pose) else None
-    name, _, leaf = key.rpartition(".")
-    shines = leaf == _POSITION and any(infos[k].brightness == "light" for k in infos if k.startswith(f"{name}."))
-    return name if shines else None
-
-
-def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]) -> bool:
-    """Return whether two lights or shapes have the same unknown coordinates and parameters, and equal or unknown light or materials."""
-    infos = problem.renderer.parameters()
-    parts = [{key.removeprefix(name) for key in infos if key.startswith(f"{name}.")} for name in (one, other)]
-    if moved[one] != moved[other] or parts[0] != parts[1]:
-        return False
-    shape = any(infos[one + part].shape_pose for part in moved[one])
-    placed = any(part.startswith(f".{_MOTIONS[0]}") for part in moved[one])  # otherwise each turns at its own place
-    if shape and (not placed or any(part.rpartition(".")[2].startswith(_TRANSFORM) for part in parts[0])):
-        return False
-    counted = [
-        part for part in parts[0] if (infos[one + part].brightness == "light" or shape) and not infos[one + part].rigid
-    ]
-    pairs = [(one + part, other + part) for part in counted if not part.endswith(_NORMALS)]
-    fixed = [pair for pair in pairs if not any(key in problem.shapes() for key in pair)]
-    values = problem.renderer.values([key for pair in fixed for key in pair])
-    if not all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed):
-        return False
-    known = {key: ends_of(unknown.bounds) for key, unknown in problem.unknowns.items() if not infos[key].rigid}
-    both = [(known[one + x], known[other + x]) for x in (*counted, *moved[one]) if {one + x, other + x} <= known.keys()]
-    return all(max(a[0], b[0]) <= min(a[1], b[1]) for a, b in both)  # bounds with a common value
-
-
-def _equal(one: np.ndarray, other: np.ndarray, vertices: bool) -> bool:
-    """Return whether two values are equal, up to a common shift for positions (V * 3,)."""
-    if not vertices:
-        return np.array_equal(one, other)
-    centred = [x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=0) for x in (one, other)]
-    return one.shape == other.shape and np.allclose(*centred, atol=_ROUNDING * float(np.abs(centred[0]).max()))
 
 
 def better_place(
@@ -329,13 +253,8 @@ def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
     """Return the keys whose places are compared together: those of each shape, and all others."""
     groups: dict[str, list[str]] = {}
     for key in keys:
-        groups.setdefault(_owner(key) if _is_shape(problem, key) else "", []).append(key)
+        groups.setdefault(owner(key) if _is_shape(problem, key) else "", []).append(key)
     return list(groups.values())
-
-
-def _owner(key: str) -> str:
-    parts = key.split(".")
-    return ".".join(parts[: next((i for i, part in enumerate(parts) if part in _MOTIONS), len(parts))])
 
 
 def _range(problem: Problem, key: str, value: float) -> Bounds:
