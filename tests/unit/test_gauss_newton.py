@@ -314,6 +314,10 @@ def test_only_numbers_that_the_trust_region_holds_away_from_the_minimum_have_no_
     held = replace(state, lengths=np.ones(3), radii=np.full(3, radius))
     assert "".join(optimizer.standard_errors(held, away)) == told
     assert optimizer.is_short(held, away) is ("x" not in told)
+    # Weights that change with the noise leave few models, and steps at noisy references that are shorter than the errors.
+    few, error = replace(state, counts=np.ones(3)), np.concatenate([known["x"], known["y"]])
+    assert not optimizer.is_short(replace(few, step=0.5 * error), tree)
+    assert optimizer.is_short(replace(few, step=2.0 * error), tree)
 
 
 @pytest.mark.slow

@@ -234,8 +234,11 @@ class AveragedNewton:
         return {key: x[0] for key, x in errors.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
 
     def is_short(self, state: AveragedNewtonState, parameters: Tree) -> bool:
-        """Return whether means have too few models for standard errors. Long steps and steps that the trust region cuts leave few."""
-        return bool((self._errors(state, parameters)[1] < _FEWEST_MODELS).any())
+        """Return whether means have too few models for standard errors, after steps that are longer than these or that a region cuts."""
+        # Weights by noise change from step to step. At noisy references they leave few models, too, but short steps.
+        errors, counts = self._errors(state, parameters)
+        long = np.abs(state.step) > np.where(np.isfinite(errors), errors, 0.0)
+        return bool(((counts < _FEWEST_MODELS) & ((counts == 0.0) | long)).any())
 
     def _errors(self, state: AveragedNewtonState, parameters: Tree) -> tuple[np.ndarray, np.ndarray]:
         """Return the standard errors of A⁻¹ b, 0 if they are unknown, and the effective number of models, (n,) each. That is 0 for blocks
