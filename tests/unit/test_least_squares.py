@@ -12,6 +12,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from unrender.core import timing
 from unrender.core.random import Key
 from unrender.estimators.base import pixel_weights
 from unrender.estimators.gauss_newton import GaussNewtonState
@@ -830,3 +831,22 @@ def test_errors_are_those_of_slopes_at_the_end_where_pictures_change_faster_furt
     wide = check_numbers(made, end, made.initial_values(), FAR)
     assert wide.errors["b"] < 0.5 * expected
     assert abs(wide.steps["b"][0]) < 0.02
+
+
+def test_short_differences_that_tell_nothing_new_take_no_pictures_from_the_test(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The roughness of a mirror had no standard error, since noise hid it in half of the pictures."""
+    made, repeats = problem(MATRIX), []
+    own, tried = least_squares._repeated, least_squares.narrowed
+
+    def repeated(numbers: Any, directions: np.ndarray, key: Any, until: float) -> Any:
+        repeats.append(until - timing.now())
+        return own(numbers, directions, key, until)
+
+    monkeypatch.setattr(least_squares, "_repeated", repeated)
+    for narrow in (lambda _numbers, differences, *_: (differences, np.inf), tried):
+        monkeypatch.setattr(least_squares, "narrowed", narrow)
+        with timing.counting():
+            check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.5)
+    assert repeats[0] == pytest.approx(repeats[1])

@@ -137,7 +137,10 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
         zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
+    began = timing.now()
     differences, limits = narrowed(numbers, differences, key.fold(_SHORT), until - 3.0 * longest)
+    # Counted renderings need not keep a time, and without those that told nothing new, noise hid numbers that it had not hidden.
+    until += (timing.now() - began) * timing.counts()
     moved, fixed = fields_of(numbers, sensitivities)
     if moved:
         half = 0.5 * (timing.now() + until)
