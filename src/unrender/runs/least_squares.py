@@ -86,7 +86,7 @@ def check_numbers(
     if numbers is None or not compares(problem):
         return NumbersCheck()
     limit = seconds if timing.counts() else math.inf
-    affordable = numbers.affordable(_PASSES + 2, limit) or numbers.affordable(_PASSES + 1, limit)  # with `narrowed`
+    affordable = numbers.affordable(_PASSES + 1, limit)
     if affordable is None:
         return NumbersCheck(unchecked=numbers.keys)
     stated = np.concatenate([np.ravel(known.get(k, np.full(values[k].size, math.inf))) for k in affordable.keys])
@@ -137,8 +137,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
         zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
-    began = timing.now()
-    differences, limits = narrowed(numbers, differences, key.fold(_SHORT), until - 3.0 * longest)
+    began, latest = timing.now(), math.inf if timing.counts() else until - 3.0 * longest
+    differences, limits = narrowed(numbers, differences, key.fold(_SHORT), latest)
     # Counted renderings need not keep a time, and without those that told nothing new, noise hid numbers that it had not hidden.
     until += (timing.now() - began) * timing.counts()
     moved, fixed = fields_of(numbers, sensitivities)
