@@ -237,21 +237,6 @@ def test_a_factor_that_least_squares_know_is_not_open(error: float, fits: bool, 
     assert (line in found.undetermined) is open_
 
 
-@pytest.mark.parametrize(("step", "told"), [(0.5, True), (0.1, False)])
-def test_a_number_that_a_long_but_noisy_step_leaves_open_is_told(step: float, told: bool, monkeypatch: Any) -> None:
-    """A sheen ended at 0.26 ± 0.56, where the truth is 0.8, and counted as determined."""
-    made, values = problem(), {"wall": np.full(3, 0.4, np.float32)}
-    noise, steps = {"wall": np.full(3, 0.15)}, {"wall": np.full(3, step)}
-    check = least_squares.NumbersCheck(
-        {}, {}, {"wall": np.full(3, 0.01)}, steps, noise, limits={"wall": np.full(3, 0.25)}
-    )
-    monkeypatch.setattr(final_images, "check_numbers", lambda *_: check)
-    for name in ("_differs", "differs_still"):
-        monkeypatch.setattr(final_images, name, lambda *_: None)
-    found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"))
-    assert any("wall: known to ± 0.5 only" in line for line in found.undetermined) is told
-
-
 def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a wrong minimum, the references do not leave a number open by what least squares say."""
     made, values, errors = problem(), {"wall": np.full(3, 0.4, np.float32)}, {"wall": np.full(3, 1e-3)}

@@ -289,7 +289,6 @@ def _undetermined(
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])
         lines += numbers.noisy(stated)
-        lines += numbers.wide({key: x for key, x in deviations.items() if key not in {*told, *numbers.unfinished}})
     elif numbers.distorted:
         lines.append(numbers.distorted)
     failed = result.status == "failed"  # such a run did not end by its budget

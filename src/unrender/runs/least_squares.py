@@ -161,7 +161,6 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     if (limits < numbers.limits).any() and (squares <= _ERRORS * errors).any():  # noise hides short differences
         found = _repeated(numbers, _directions(differences, numbers.limits, change)[0], key, until - 2.0 * longest)
     check = _checked(numbers, _Fit.of(numbers, *found), widths)
-    check = replace(check, limits={k: numbers.limits[of] for k, of in numbers.places().items()})
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="", blind=()) if fixed else check
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from unrender.core import arrays, timing
 from unrender.core.random import Key
 from unrender.core.text import listed
-from unrender.display import formatting
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.runs.image_sensitivity import ADJOINT, adjoint_spp, mask_roots
 from unrender.scene.problem import Problem
@@ -316,7 +315,6 @@ class NumbersCheck:
         unchecked: keys of the numbers whose standard errors are unknown.
         blind: keys of the numbers whose influence on the pictures is hidden by the noise of this check.
         elsewhere: keys of the numbers that only other views show than the tested ones.
-        limits: {key: largest changes of its numbers in a difference}: a quarter of their range, or about half of their size.
         distorted: line about references that look distorted, so that the numbers have no standard errors; "" for none.
         fixed: {key: reason} of unknowns that trade off against the numbers in directions that the test leaves out; {} if there was no
             time for the test.
@@ -332,7 +330,6 @@ class NumbersCheck:
     elsewhere: tuple[str, ...] = ()
     fixed: Mapping[str, str] = field(default_factory=dict)
     distorted: str = ""
-    limits: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def missing(self, reported: Collection[str] = ()) -> list[str]:
         """Return lines: why the standard errors of the unchecked numbers, and of those of other views, are unknown.
@@ -356,15 +353,6 @@ class NumbersCheck:
         keys = [key for key in self.blind if key not in known]
         what = "standard errors are unknown: the noise of the test at the end hides how the pictures depend on them; give more steps"
         return [f"{listed(keys)}: {what}, or less noise, such as by larger lights"] if keys else []
-
-    def wide(self, errors: Mapping[str, np.ndarray]) -> list[str]:
-        """Return a line for each number with a finite standard error of {key: array} above its limit, and no other line."""
-        which = "more than a quarter of its range, or than half of its size; give more steps or samples, or add views"
-        return [
-            f"{key}: known to ± {formatting.number(float(x.max()))} only, {which}"
-            for key, x in errors.items()
-            if key in self.limits and self.limits[key].max() < x.max() < math.inf and key not in self.undetermined
-        ]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None, complete: bool = False
