@@ -86,7 +86,7 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session")
-def mitsuba_variant(pytestconfig: pytest.Config) -> str:
+def mitsuba_variant() -> str:
     """The variant of this test session: the CPU's, so that numbers are the same everywhere, or `UNRENDER_VARIANT`."""
     import drjit as dr
 
@@ -96,27 +96,11 @@ def mitsuba_variant(pytestconfig: pytest.Config) -> str:
         pytest.exit(str(error), returncode=3)  # once, not once per test
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        # Each worker would start a thread per core, and a tenth of the processor time or more would go into waiting for each other.
-        fewest = 1 if pytestconfig.option.markexpr == "not slow" else 2
-        dr.set_thread_count(max(fewest, dr.thread_count() // workers))
-        lend_threads()
+        # Each worker would start a thread per core, and they would wait for each other. With one thread Mitsuba's EXR writer hangs.
+        dr.set_thread_count(max(2, dr.thread_count() // workers))
     count_scenes()
     gc.freeze()  # Mitsuba's module, and no scene yet
     return name
-
-
-def lend_threads() -> None:
-    """Let the tests' own files be read and written with one thread, as the library's are: OpenEXR would wait for ever for a second one."""
-    import mitsuba as mi
-
-    def lent(function: Any) -> Any:
-        def call(*arguments: Any, **options: Any) -> Any:
-            with variant.two_threads():
-                return function(*arguments, **options)
-
-        return call
-
-    mi.Bitmap.write, mi.load_file, mi.load_dict = map(lent, (mi.Bitmap.write, mi.load_file, mi.load_dict))
 
 
 def count_scenes() -> None:
