@@ -138,8 +138,9 @@ def test_suggestions_take_no_time():
     assert time.process_time() - began < 1
 
 
-def test_letters_in_another_order_are_the_nearest_name():
+def test_exchanged_neighbouring_letters_are_the_nearest_name():
     assert did_you_mean("wiht", ["weight", "with"]) == "; did you mean with?"
+    assert did_you_mean("relu3_4", ["relu4_3", "relu3_3"]) == "; did you mean relu3_3?"
 
 
 def test_long_lists_of_names_are_cut():

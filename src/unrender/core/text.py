@@ -115,14 +115,15 @@ _SYNONYMS = {
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
     """Return "; did you mean X?" with the nearest known name, or "" if none has the `difflib` similarity `likeness`.
 
-    A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate), then one of the
-    same letters (wiht for with). Only the first 1000 names of at most 200 characters are compared.
+    A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate), then one with two
+    neighbouring letters exchanged (wiht for with). Only the first 1000 names of at most 200 characters are compared.
     """
     if len(name) > _LONGEST:
         return ""
     names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]
     synonyms = [each for each in _SYNONYMS.get(name.lower(), ()) if each in names]
-    swapped = [each for each in names if sorted(each) == sorted(name)]
+    swaps = {name[:i] + name[i + 1] + name[i] + name[i + 2 :] for i in range(len(name) - 1)}
+    swapped = [each for each in names if each in swaps]
     near = same[:1] or synonyms[:1] or swapped[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""
