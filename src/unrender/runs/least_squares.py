@@ -85,9 +85,7 @@ def check_numbers(
     numbers = Numbers.of(problem, values, start)
     if numbers is None or not compares(problem):
         return NumbersCheck()
-    limit = seconds if timing.counts() else math.inf
-    affordable = numbers.affordable(_PASSES + 1, limit)
-    if affordable is None:
+    if (affordable := numbers.affordable(_PASSES + 1, seconds if timing.counts() else math.inf)) is None:
         return NumbersCheck(unchecked=numbers.keys)
     stated = np.concatenate([np.ravel(known.get(k, np.full(values[k].size, math.inf))) for k in affordable.keys])
     numbers = replace(affordable, weights=weights, ends=ends, settled=stated < _DOUBTFUL * affordable.sizes)
@@ -156,11 +154,11 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             break
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
         directions, length = _directions(again, limits, change)
-    found = _repeated(numbers, directions, key, until - 2.0 * longest)
-    squares, errors = found[0].squares()
+    judged = _repeated(numbers, directions, key, until - 2.0 * longest)
+    squares, errors = judged[0].squares()
     if (limits < numbers.limits).any() and (squares <= _ERRORS * errors).any():  # noise hides short differences
-        found = _repeated(numbers, _directions(differences, numbers.limits, change)[0], key, until - 2.0 * longest)
-    check = _checked(numbers, _Fit.of(numbers, *found), widths)
+        judged = _repeated(numbers, _directions(differences, numbers.limits, change)[0], key, until - 2.0 * longest)
+    check = _checked(numbers, _Fit.of(numbers, *judged), widths)
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="", blind=()) if fixed else check
 
 
@@ -291,8 +289,8 @@ class _Fit:
         better = math.inf if before is None else _better(residuals, before)
         seen = np.where(hidden[:, None, None], 0.0, slopes)
         seen_inverse = np.where(hidden, 0.0, inverse)
-        found = distortions_of_fit(numbers, residuals, after, seen, seen_inverse)
-        distortions = [(words, changes[:n] @ moves) for words, moves in found]
+        looks_like = distortions_of_fit(numbers, residuals, after, seen, seen_inverse)
+        distortions = [(words, changes[:n] @ moves) for words, moves in looks_like]
         return cls(
             total, error, own, step[:n], unseen[:, hidden], blind, better, beyond,
             distortions, unexplained_share(numbers, seen, seen_inverse),

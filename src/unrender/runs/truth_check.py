@@ -45,9 +45,9 @@ def with_few_steps(problem: Problem, result: Result, short: bool = False) -> Res
     that they are few whatever their number."""
     unknown = [key for key in problem.unknowns if key not in result.standard_error]
     lines = (*result.warnings, *result.undetermined)
-    told = any(x in line for x in ("more steps", "more seconds", "of at least", "allows about") for line in lines)
+    advised = any(x in line for x in ("more steps", "more seconds", "of at least", "allows about") for line in lines)
     short = result.steps > 0 and (short or result.steps < FEW_NEWTON_STEPS)
-    if result.status != "finished" or told or not unknown or not short:
+    if result.status != "finished" or advised or not unknown or not short:
         return result
     steps = "1 step is" if result.steps == 1 else f"{result.steps} steps are"
     line = f"{steps} too few to judge whether {listed(unknown)} converged: give more steps"

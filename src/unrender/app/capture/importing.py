@@ -264,12 +264,12 @@ def _capture(folder: Path, options: ImportOptions) -> Capture:
 def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tuple[StoredViews, list[str]]:
     with phases.phase("photographs") as advance:
         size = options.resolution, options.scale
-        views, told = prepare(
+        views, lines = prepare(
             capture, *size, options.hold_out, lambda done, n: advance(done / n), options.response, masks=masks
         )
         exposed = "exposure" in (options.unknowns or ())
         photographs = [photograph.file for photograph in capture.photographs]
-        return views, told + pictures.notices(photographs, exposed, options.response)
+        return views, lines + pictures.notices(photographs, exposed, options.response)
 
 
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
