@@ -265,7 +265,7 @@ def test_a_shared_part_is_measured() -> None:
 # ---------------------------------------------------------------------- runs that are right
 
 
-@pytest.mark.parametrize("seeds", [range(4), slow(range(4, 150))], ids=str)
+@pytest.mark.parametrize("seeds", [range(4), slow(range(4, 78))], ids=str)
 @pytest.mark.parametrize(
     "estimator",
     [
@@ -531,7 +531,7 @@ def test_references_without_a_known_truth_may_differ_by_a_quarter_as_photographs
     assert result.status == status
 
 
-@pytest.mark.parametrize("seeds", [range(3), slow(range(3, 100))], ids=str)
+@pytest.mark.parametrize("seeds", [range(3), slow(range(3, 51))], ids=str)
 @pytest.mark.parametrize("rate", [slow(0.02), 0.2])
 def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, seeds: range) -> None:
     for seed in seeds:
@@ -669,7 +669,7 @@ def test_a_local_minimum_of_few_pixels_is_told(side: int, known: bool) -> None:
         assert result.status == "does not fit"
 
 
-@pytest.mark.parametrize("seeds", [range(2), slow(range(2, 50))], ids=str)
+@pytest.mark.parametrize("seeds", [range(2), slow(range(2, 26))], ids=str)
 @pytest.mark.parametrize(("grain", "known"), [slow(0.0, False), (0.05, False), slow(0.0, True), (0.3, True)])
 @pytest.mark.parametrize("side", [1, 4])
 def test_few_pixels_that_have_converged_have_nothing_unexplained(
