@@ -311,3 +311,17 @@ def test_repeated_columns_follow_in_a_descent(folder: Path, method: str):
     found = result.parameters["sky.data"]
     assert np.ptp(found) > 0
     np.testing.assert_array_equal(found, periodic.repeat(found, 1))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4), (3,)])
+def test_integers_of_a_stored_picture_are_no_linear_values(dtype: type, shape: tuple[int, ...]) -> None:
+    """A reflectance of 128 became 1 in silence. Zeros and ones, as of a mask, mean what they are."""
+    stored = np.full(shape, 128, dtype)
+    whole = (4, 4, 3) if len(shape) != 2 else (4, 4, 1)
+    with pytest.raises(InputError, match="integers of 8 or 16 bits up to 128"):
+        parameter_values.fill(stored, whole)
+    with pytest.raises(InputError, match="integers of 8 or 16 bits up to 128"):
+        parameter_values.fill(mi.Bitmap(np.full((4, 4, 3), 128, dtype)), (4, 4, 3))
+    assert parameter_values.fill(stored / np.float32(256), whole)[0].max() == 0.5
+    assert parameter_values.fill(stored // 128, whole)[0].max() == 1
