@@ -74,14 +74,14 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
     A number fills any shape, a colour the last axis. An image file fills (H, W, C), and a .vol file (Z, Y, X, C); other resolutions are
     resized. A mesh file fills values at vertices. An array, a .npy file, or an .npz archive of one array must have the shape; a last axis
     of length 1 may be missing. A shape of one axis, such as that of vertices (n V,), also accepts (V, n) with V >= n or V = 1. Images and
-    arrays may omit repeated border columns. Values of arrays are not rescaled.
+    arrays may omit repeated border columns. Values of arrays are linear and not rescaled.
 
     Args:
         initial: the value as passed.
         conversion: the renderer's conversion of such a file in a scene.
 
     Raises:
-        InputError: the value does not fit, cannot be read, or is not finite.
+        InputError: the value does not fit, cannot be read, is not finite, or has integers of 8 or 16 bits above 1.
     """
     if isinstance(initial, (str, Path)):
         path = Path(initial)
