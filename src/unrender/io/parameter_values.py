@@ -94,18 +94,19 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         array = arrays.to_numpy(initial, shape)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
             raise TypeError
-        stored = array.dtype in (np.uint8, np.uint16) and array.size > 1 and array.max() > 1
-        with np.errstate(over="ignore"):
-            array = conversion.stored(array.astype(np.float32))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"expected a number, a colour, a picture or grid file or an array, got {_short(initial)}"
         ) from error
-    if stored:  # 128 was taken for 1, the upper bound of a reflectance
+    if (
+        array.dtype in (np.uint8, np.uint16) and array.size > 1 and array.max() > 1
+    ):  # 128 was taken for 1, the upper bound of a reflectance
         raise InputError(
             f"expected linear values, got integers of 8 or 16 bits up to {array.max():g}, as pictures are stored: pass the file, which is "
             "converted as Mitsuba does, or floating-point values"
         )
+    with np.errstate(over="ignore"):
+        array = conversion.stored(array.astype(np.float32))
     if not np.isfinite(array).all():
         raise InputError("must be finite, got NaN or infinite values")
     if array.size > 3 and not conversion.takes_number and not np.ptp(array):
