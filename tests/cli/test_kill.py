@@ -145,35 +145,37 @@ def wait_for_steps(process: subprocess.Popen[str], folder: Path, steps: int) -> 
 
 
 def kill_command(tmp_path: Path, name: str, seed: int) -> None:
-    """Kill a command once in the first and once in the second half of its steps."""
-    dice, tried = random.Random(f"{name} {seed}"), 0
+    """Kill a command in the first half of its steps, resume it, and kill it again in the second half."""
+    dice = random.Random(f"{name} {seed}")
     words = [*COMMANDS[name], "--steps", COMMAND_STEPS, "--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1]
     whole = tmp_path / "whole"
     status = finish(command("run", *words, "--out", whole, "--checkpoint-every", 7))
     assert status in ENDED
-    for first, last in ((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS)):
-        while True:
-            tried += 1
-            assert tried < 10
-            folder = tmp_path / str(tried)
-            process = command("run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3)))
+    tried, killed = 0, False
+    while not killed:
+        tried += 1
+        assert tried < 10
+        folder = tmp_path / str(tried)
+        line: list[object] = ["run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3))]
+        for first, last in ((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS)):
+            process = command(*line)
             wait_for_steps(process, folder, dice.randint(first, last))
             time.sleep(dice.uniform(0, 0.05))
             process.kill()
             ended = finish(process)
             if ended in ENDED:
                 assert ended == status
-                continue
+                break
             check_readable(folder)
             begun = (folder / "run.json").exists()
             done = ("finished", WORSE, MEMORY_DISAGREES)
-            if not (begun and json.loads((folder / "run.json").read_text())["status"] in done):
-                break  # else it died while it wrote its page, and is refused: there is nothing to go on with
-        again = (
-            ["resume", folder] if begun else ["run", *words, "--out", folder, "--overwrite", "--checkpoint-every", 5]
-        )
-        assert finish(command(*again)) == status, tried
-        assert states(folder) == states(whole), tried
+            if begun and json.loads((folder / "run.json").read_text())["status"] in done:
+                break  # it died while it wrote its page, and is refused: there is nothing to go on with
+            line = ["resume", folder] if begun else [*line[:-1], 5, "--overwrite"]
+        else:
+            killed = True
+    assert finish(command(*line)) == status, tried
+    assert states(folder) == states(whole), tried
 
 
 @pytest.mark.slow
