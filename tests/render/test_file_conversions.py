@@ -315,13 +315,19 @@ def test_repeated_columns_follow_in_a_descent(folder: Path, method: str):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4), (3,)])
-def test_integers_of_a_stored_picture_are_no_linear_values(dtype: type, shape: tuple[int, ...]) -> None:
-    """A reflectance of 128 became 1 in silence. Zeros and ones, as of a mask, mean what they are."""
+def test_integers_of_a_stored_picture_are_no_linear_values(dtype: type, shape: tuple[int, ...], tmp_path: Path) -> None:
+    """A reflectance of 128 became 1 in silence, also from a file. Zeros and ones, as of a mask, mean what they are."""
     stored = np.full(shape, 128, dtype)
     whole = (4, 4, 3) if len(shape) != 2 else (4, 4, 1)
     with pytest.raises(InputError, match="integers of 8 or 16 bits up to 128"):
         parameter_values.fill(stored, whole)
     with pytest.raises(InputError, match="integers of 8 or 16 bits up to 128"):
         parameter_values.fill(mi.Bitmap(np.full((4, 4, 3), 128, dtype)), (4, 4, 3))
+    for name, save in (("a.npy", np.save), ("a.npz", np.savez)):
+        save(tmp_path / name, stored)
+        with pytest.raises(InputError, match=rf"{name}: expected linear values.* up to 128"):
+            parameter_values.fill(tmp_path / name, whole)
+        save(tmp_path / name, stored > 1)
+        assert parameter_values.fill(tmp_path / name, whole)[0].max() == 1
     assert parameter_values.fill(stored / np.float32(256), whole)[0].max() == 0.5
     assert parameter_values.fill(stored // 128, whole)[0].max() == 1

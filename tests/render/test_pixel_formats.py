@@ -74,15 +74,18 @@ def test_a_file_that_calls_values_of_an_xyz_film_rgb_is_refused(pixel_format: st
         problem(pixel_format, tmp_path / "reference.exr")
 
 
-@pytest.mark.parametrize("of", ["array", "PIL", "torch"])
-def test_bytes_are_srgb_for_an_xyz_film_too(of: str) -> None:
-    """Pictures of PIL and PyTorch, whose kind of number is not told as NumPy's, were converted as if they were XYZ."""
+@pytest.mark.parametrize("of", ["array", "PIL", "torch", "npy"])
+def test_bytes_are_srgb_for_an_xyz_film_too(of: str, tmp_path: Path) -> None:
+    """Pictures of PIL and PyTorch, whose kind of number is not told as NumPy's, and .npy files were converted as if they were XYZ."""
     given: Any = np.tile(np.array([200, 120, 60], np.uint8), (6, 6, 1))
     expected = np.asarray(problem("rgb", given).views[0].reference)
     if of == "PIL":
         given = Image.fromarray(given)
     elif of == "torch":
         given = pytest.importorskip("torch").tensor(given)
+    elif of == "npy":
+        np.save(tmp_path / "a.npy", given)
+        given = tmp_path / "a.npy"
     np.testing.assert_allclose(np.asarray(problem("xyz", given).views[0].reference), expected, atol=1e-6)
 
 

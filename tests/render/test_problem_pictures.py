@@ -282,6 +282,11 @@ def test_integers_of_unknown_encoding_are_no_picture(kind: type):
     np.testing.assert_array_equal(images.read(np.eye(3, dtype=kind)).values[..., 0], np.eye(3))
 
 
+def test_rows_of_different_lengths_are_no_picture():
+    with pytest.raises(InputError, match=r"^expected a file or an array of numbers, got rows of different lengths$"):
+        images.read([[1, 2], [3]])
+
+
 def test_a_picture_cannot_fill_a_volume(tmp_path: Path):
     with pytest.raises(InputError, match=r"a picture cannot fill a parameter of shape \(3,\)"):
         values.fill(bitmap(COLOURS, tmp_path / "a.exr"), (3,))

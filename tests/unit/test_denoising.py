@@ -88,9 +88,10 @@ def test_what_makes_no_sense_is_refused() -> None:
         (np.full((4, 4), 1e39), "finite"),
         (np.array([["a"]]), "numbers"),
         (np.ones((2, 2), complex), "numbers"),
+        ([[1.0], []], "rows of different lengths"),
     ):
         with pytest.raises(ur.InputError, match=what):
-            denoise(bad, by="variation")
+            denoise(bad, by="variation")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ur.InputError, match="did you mean oidn"):
         denoise(good, by="oid")  # pyright: ignore[reportArgumentType]
 

@@ -264,6 +264,8 @@ def test_values_come_in_several_forms() -> None:
         (lambda: ur.Renderer(scene(), KEYS).render(START["colour"]), r"expected \{key: array\} for colour, map"),
         (lambda: ur.Renderer(scene(), KEYS).render({**START, "colour": np.ones(4)}), r"colour: expected shape \(3,\), got \(4,\)"),
         (lambda: ur.Renderer(scene(), KEYS).render({**START, "colour": ["a"] * 3}), "colour: expected an array of numbers"),
+        (lambda: ur.Renderer(scene(), KEYS).render({**START, "colour": [[1], []]}), "colour: .*, got rows of different lengths$"),
+        (lambda: ur.Renderer(scene(), KEYS).render({**START, "colour": bytearray(b"abc")}), "colour: expected linear values"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_one_line(make: Callable[[], Any], message: str) -> None:

@@ -109,6 +109,8 @@ def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):
         (uncertainty, {"values": None}, r"parameters: expected \['wall'\], got \[\]"),
         (uncertainty, {"values": {"wall": np.full(TEXTURE, np.nan)}}, "parameter wall: expected finite numbers"),
         (uncertainty, {"values": {"wall": np.full(TEXTURE, "0.5")}}, "parameter wall: expected finite numbers"),
+        (uncertainty, {"values": {"wall": np.full(TEXTURE, 128, np.uint8)}}, "parameter wall: expected linear values"),
+        (uncertainty, {"values": {"wall": [[1, 2], [3]]}}, "parameter wall: .*, got rows of different lengths$"),
     ],
 )
 def test_refuses_what_makes_no_sense(function: Any, given: dict[str, Any], message: str):

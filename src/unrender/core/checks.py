@@ -16,7 +16,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, in_words, printable
+from unrender.core.text import did_you_mean, in_words, printable, reason_of
 
 LARGEST = (1 << 63) - 1
 """Largest whole number that the files of a run hold."""
@@ -196,3 +196,15 @@ def array_like(value: Any, advice: str) -> Any:
         raise InputError(f"a masked array has values that do not count: {advice}")
     detach = getattr(value, "detach", None)
     return value if detach is None or not hasattr(value, "cpu") else detach().cpu()
+
+
+def as_array(value: Any, owner: str, what: str = "an array of numbers") -> Any:
+    """Return `numpy.asarray(value)`. Raises `InputError` that begins with `owner` and says `what` was expected."""
+    import numpy as np
+
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError) as error:
+        ragged = "inhomogeneous" in str(error)
+        got = "rows of different lengths" if ragged else f"{type(value).__name__}: {reason_of(error, 100)}"
+        raise InputError(f"{owner}expected {what}, got {got}") from error

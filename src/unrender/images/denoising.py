@@ -94,7 +94,7 @@ def denoise(image: np.ndarray, by: Denoiser = "auto", fast: bool = False) -> np.
 
 
 def _checked(image: Any) -> np.ndarray:
-    array = np.asarray(image)
+    array = checks.as_array(image, "denoise: image: ")
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise InputError(f"denoise: image must be an array of numbers, got {array.dtype}")
     if (array.ndim not in (2, 3)) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:

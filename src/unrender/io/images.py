@@ -80,11 +80,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         return replace(picture, notice=f"{path.name}: {picture.notice}" if picture.notice else "")
     source = checks.array_like(source, "fill it, and give mask = ~numpy.ma.getmaskarray(image)[..., 0] to the view")
-    try:
-        array = np.asarray(source)
-    except (TypeError, ValueError) as error:
-        what = f"expected a file or an array, got {type(source).__name__}"
-        raise InputError(f"{what}: {reason_of(error, 100)}") from error
+    array = checks.as_array(source, "", "a file or an array of numbers")
     if is_bitmap(source) and array.dtype in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
         picture = _of_bitmap(type(source)(source), linearise, alpha)
     else:

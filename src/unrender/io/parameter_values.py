@@ -98,13 +98,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         raise InputError(
             f"expected a number, a colour, a picture or grid file or an array, got {_short(initial)}"
         ) from error
-    if (
-        array.dtype in (np.uint8, np.uint16) and array.size > 1 and array.max() > 1
-    ):  # 128 was taken for 1, the upper bound of a reflectance
-        raise InputError(
-            f"expected linear values, got integers of 8 or 16 bits up to {array.max():g}, as pictures are stored: pass the file, which is "
-            "converted as Mitsuba does, or floating-point values"
-        )
+    refuse_encoded(array)
     with np.errstate(over="ignore"):
         array = conversion.stored(array.astype(np.float32))
     if not np.isfinite(array).all():
@@ -125,6 +119,15 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
     raise InputError(f"expected {_expected(shape, conversion)}, got {got}")
 
 
+def refuse_encoded(values: np.ndarray, where: str = "") -> None:
+    """Raise `InputError` that begins with `where` for several unsigned integers of 8 or 16 bits above 1: levels of a picture."""
+    if values.dtype in (np.uint8, np.uint16) and values.size > 1 and values.max() > 1:
+        raise InputError(
+            f"{where}expected linear values, got integers of 8 or 16 bits up to {values.max():g}, as pictures are stored: convert them to "
+            "linear floating-point values, or give the picture's file as initial value"
+        )
+
+
 def at_one_point(positions: np.ndarray) -> bool:
     """Return whether the positions (n V,) of several vertices are all equal."""
     return positions.size > 3 and not np.ptp(positions.reshape(-1, 3), axis=0).any()
@@ -137,7 +140,11 @@ def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
     if ending in MESH_FILES:
         return _from_mesh(path, shape, conversion), ""
     if ending in (".npy", ".npz"):
-        return fill(volumes.read_numpy(path, lambda size: _check_shape(size, shape, conversion)), shape, conversion)
+        array = volumes.read_numpy(path, lambda size: _check_shape(size, shape, conversion))
+        try:
+            return fill(array.astype(np.uint8) if array.dtype == bool else array, shape, conversion)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
     picture = images.read(path, not conversion.raw)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")

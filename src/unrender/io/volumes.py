@@ -73,7 +73,9 @@ def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) ->
 
     if file.suffix.lower() == ".vol":
         return _read_vol(file, suits)
-    array = read_numpy(file, suits)
+    with np.errstate(over="ignore"):
+        array = read_numpy(file, suits).astype(np.float32)
+    _check_finite(file, array)
     return Grid(array if array.ndim == 4 else array[..., None])
 
 
@@ -122,7 +124,7 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
 
 
 def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.ndarray:
-    """Read the array of a `.npy` file, or the only one of an `.npz` archive, as float32 of any shape. Raises `InputError`."""
+    """Read the array of a `.npy` file, or the only one of an `.npz` archive: finite real numbers as stored. Raises `InputError`."""
     file = _existing(path)
 
     def named(shape: Shape) -> None:
@@ -136,8 +138,6 @@ def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.n
         (array,) = bounded_files.read_arrays(file, check=named, one=True).values()
     else:
         array = bounded_files.read_array(file, check=named)
-    with np.errstate(over="ignore"):
-        array = array.astype(np.float32)
     _check_finite(file, array)
     return array
 

@@ -39,7 +39,7 @@ class Parameter:
             parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated columns of an
             environment map, the transform of a mesh. Images and `.vol` grids of another resolution are resized. A `.npy` file, or an
             `.npz` archive of one array, must have the parameter's shape; a last axis of length 1 and the repeated columns of an
-            environment map may be missing.
+            environment map may be missing. Arrays are linear; those of 8 and 16 bits above 1, which are sRGB in a view, are refused.
         bounds: (low, high); either may be None. None takes the physical range if it is known (a reflectance: 0 to 1).
         learning_rate: learning rate of this parameter; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.

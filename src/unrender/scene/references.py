@@ -33,8 +33,8 @@ class View:
     """A reference image of the scene and its sensor.
 
     Args:
-        reference: file, or array (H, W, 3), in linear RGB. 8- and 16-bit files are converted from sRGB. An array has the film's format:
-            luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Of 8- and 16-bit images with alpha only opaque pixels
+        reference: file, or array (H, W, 3), in linear RGB. Files and arrays of 8 and 16 bits are converted from sRGB. Other arrays have the
+            film's format: luminance (H, W) or XYZ (H, W, 3) by its `pixel_format`. Of 8- and 16-bit images with alpha only opaque pixels
             count, since rendered edges mix an object with what is behind it. Alpha of floating-point images is ignored, because films
             store premultiplied colours.
         sensor: index of the scene's sensor.

@@ -1,9 +1,9 @@
 """Validation of views and of their images.
 
-References are linear in what the camera saw. Files with 8 and 16 bits per channel are taken as sRGB and linearised, with a notice. `.exr`,
+References are linear in what the camera saw. Files and arrays of 8 and 16 bits are taken as sRGB and linearised, with a notice. `.exr`,
 `.hdr` and floating-point arrays are linear. Masks are taken as they are.
 
-| `pixel_format` of the film | array or `.npy` | comparison |
+| `pixel_format` of the film | floating-point array or `.npy` | comparison |
 |---|---|---|
 | `rgb`, `rgba` | (H, W, 3) or (H, W, 4) | red, green and blue |
 | `xyz`, `xyza` | (H, W, 3) or (H, W, 4) | converted to RGB |
@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, checks
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.io import images, parameter_values
 from unrender.io.stored_pictures import PictureStore, StoredPicture
@@ -67,8 +67,8 @@ class Reference:
 def read_reference(source: Any, form: PictureFormat) -> Reference:
     """Read the reference from a file or an array.
 
-    An array, or a .npy file, contains the film's format. Other files specify their own colour space. Opaque pixels of 8- and 16-bit images
-    become a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
+    An array, or a .npy file, contains the film's format, and sRGB in 8 or 16 bits. Other files specify their own colour space. Opaque
+    pixels of 8- and 16-bit images become a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
 
     Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative. It also
     does so for floating-point files labelled RGB of films that store XYZ: `mi.util.write_bitmap` labels XYZ values so.
@@ -94,7 +94,8 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         raise InputError(
             "it has one channel, but the film's pixel_format is xyz; use an image of X, Y and Z, or the pixel_format luminance"
         )
-    if xyz and not (image.notice or image.labelled_xyz or _is_of_film(source)):
+    of_film = not image.notice and _is_of_film(source)
+    if xyz and not (image.notice or image.labelled_xyz or of_film):
         raise InputError(
             "the file names its channels R, G and B, but the film's pixel_format is xyz, so either may be meant; "
             "write XYZ values to a .npy file, or use the pixel_format rgb"
@@ -102,7 +103,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     if not form.signed:
         _check_not_negative(values)
     notices = [notice for notice in (image.notice, profile) if notice]
-    if xyz and _is_of_film(source):
+    if xyz and of_film:
         values = images.xyz_to_rgb(values)
         notices.append("is in XYZ, as the film stores it, and is converted to RGB")
     elif values.shape[2] == 1 and not grey:
@@ -150,10 +151,10 @@ def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
 
 
 def _is_of_film(source: Any) -> bool:
-    """Return whether the values are in the film's format, with no colour space of their own."""
+    """Return whether floating-point values are in the film's format, with no colour space of their own."""
     if isinstance(source, (str, Path)):
         return Path(source).suffix.lower() == ".npy"
-    return not (images.is_bitmap(source) or np.asarray(checks.array_like(source, "")).dtype in (np.uint8, np.uint16))
+    return not images.is_bitmap(source)
 
 
 def _check_not_negative(values: np.ndarray) -> None:
