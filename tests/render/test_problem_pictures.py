@@ -77,6 +77,10 @@ def test_a_picture_that_viewers_turn_is_refused_as_reference_and_mask(tmp_path: 
         with pytest.raises(InputError, match=r"EXIF orientation is 6.*save the pixels upright"):
             check_views([view], films, L2())
     assert images.check_metadata(tmp_path / f"upright-{name}") == ""
+    # A value is what Mitsuba makes of the file, as in a scene.
+    said = "its EXIF orientation is 6, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
+    assert said in values.fill(tmp_path / name, (8, 8, 3))[1]
+    assert values.fill(tmp_path / f"upright-{name}", (8, 8, 3))[1] == f"upright-{name}: 8-bit sRGB, linearised"
 
 
 def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
@@ -86,6 +90,8 @@ def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
         picture.save(tmp_path / f"{name}.png", icc_profile=profile)
     assert images.check_metadata(tmp_path / "sRGB.png") == ""
     assert "LAB.png: its colour profile is not sRGB" in images.check_metadata(tmp_path / "LAB.png")
+    assert "its colour profile is not sRGB" in values.fill(tmp_path / "LAB.png", (6, 8, 3))[1]
+    assert values.fill(tmp_path / "LAB.png", (6, 8, 3), values.FileConversion(raw=True))[1] == ""
     # Neither the name decides, nor the kind of the pixels.
     named = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     swapped = named.replace(b"rXYZ", b"----").replace(b"gXYZ", b"rXYZ").replace(b"----", b"gXYZ")
@@ -106,6 +112,8 @@ def test_a_gamma_other_than_that_of_srgb_is_refused_in_a_reference_and_not_in_a_
         check_views([View(np.ones((8, 8, 3)), mask=tmp_path / "a.png")], films, L2())
         with pytest.raises(InputError, match="declares a gamma of") if refused else contextlib.nullcontext():
             check_views([View(tmp_path / "a.png")], films, L2())
+        assert ("declares a gamma of" in values.fill(tmp_path / "a.png", (8, 8, 3))[1]) is refused
+        assert values.fill(tmp_path / "a.png", (8, 8, 3), values.FileConversion(raw=True))[1] == ""
 
 
 def test_colours_of_adobe_rgb_without_a_profile_are_reported(tmp_path: Path):
@@ -181,6 +189,27 @@ def test_refuses_a_ppm_file_that_mitsuba_misreads(tmp_path: Path, largest: int):
     (tmp_path / "a.ppm").write_bytes(b"P6\n8 6\n%d\n" % largest + values.tobytes())
     with pytest.raises(InputError, match=rf"a\.ppm: cannot be read as a picture: the largest value .* is {largest},"):
         images.read(tmp_path / "a.ppm")
+
+
+def test_a_kind_of_pixels_that_mitsuba_does_not_decode_is_named(tmp_path: Path):
+    """The line was Mitsuba's, as "read_jpeg(): Unsupported number of components!"; BMP files of 16 bits were taken for grey and alpha."""
+    colours = Image.fromarray(np.full((6, 8, 3), 188, np.uint8))
+    bmp = struct.pack("<2sIHHIIiiHHIIiiII", b"BM", 150, 0, 0, 54, 40, 8, 6, 1, 16, 0, 96, 0, 0, 0, 0) + bytes(96)
+    (tmp_path / "words.bmp").write_bytes(bmp)
+    for name, mode, what in (
+        ("a.jpg", "CMYK", "its colours are CMYK"),
+        ("a.bmp", "1", "its bit depth is 1"),
+        ("words.bmp", "", "its bit depth is 16"),
+        ("a.tga", "P", "its colours are indexed"),
+        ("b.tga", "LA", "its bit depth is 16"),
+    ):
+        if mode:
+            colours.convert(mode).save(tmp_path / name)
+        with pytest.raises(InputError, match=f"{what}, which Mitsuba does not decode; save it as .png in RGB"):
+            images.read(tmp_path / name)
+    for name, mode in (("a.tga", "L"), ("b.tga", "RGBA"), ("a.bmp", "RGBA"), ("a.jpg", "L")):
+        colours.convert(mode).save(tmp_path / name)
+        np.testing.assert_allclose(images.read(tmp_path / name, linearise=False).values, 188 / 255, atol=0.01)
 
 
 def test_refuses_indexed_colours_that_mitsuba_takes_for_grey(tmp_path: Path):

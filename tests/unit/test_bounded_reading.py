@@ -107,9 +107,10 @@ def test_a_jpeg_that_ends_too_soon_is_refused(tmp_path: Path, progressive: bool)
     )
     (tmp_path / "a.jpg").write_bytes(file.getvalue())
     assert image_size.check(tmp_path / "a.jpg") == 3 * 64 * 64
-    (tmp_path / "a.jpg").write_bytes(file.getvalue()[:-200])
-    with pytest.raises(InputError, match="the file ends before the picture does"):
-        image_size.check(tmp_path / "a.jpg")
+    for missing in (200, 2):  # of a picture that lacks its end marker alone, nothing is missing
+        (tmp_path / "a.jpg").write_bytes(file.getvalue()[:-missing])
+        with pytest.raises(InputError, match="it has no end marker, so a part may be missing; copy the file again"):
+            image_size.check(tmp_path / "a.jpg")
 
 
 def _hdr(rows: bytes, width: int = 8, height: int = 2) -> bytes:

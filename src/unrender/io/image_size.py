@@ -255,12 +255,18 @@ def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
     return [(width, abs(height), max(bits // 8, 1))]
 
 
+def _refused(what: str) -> InputError:
+    return InputError(f"cannot be read as a picture: {what}, which Mitsuba does not decode; save it as .png in RGB")
+
+
 def _mitsubas_bmp(data: bytes, file: IO[bytes]) -> Sizes:
-    """Return the size. Raise `InputError` for indexed colours, since Mitsuba takes the indices for grey."""
+    """Return the size. Raise `InputError` for indexed colours, since Mitsuba takes the indices for grey, and 16 bits for alpha."""
     head, bits, used = (struct.unpack_from(form, data, at)[0] for form, at in (("<I", 14), ("<H", 28), ("<I", 46)))
+    if bits not in (8, 24, 32):
+        raise _refused(f"its bit depth is {bits}")
     table = data[14 + head : 14 + head + 4 * (used or 256)] if bits == 8 else b""
     if any(table[at : at + 3] != bytes([at // 4]) * 3 for at in range(0, len(table) - 3, 4)):
-        raise InputError("cannot be read as a picture: its colours are indexed, expected 24 bits; save it as .png")
+        raise _refused("its colours are indexed")
     return _bmp(data, file)
 
 
@@ -274,6 +280,8 @@ def _mitsubas_tga(data: bytes, file: IO[bytes]) -> Sizes:
     skipped, _, kind = struct.unpack_from("<3B", data)
     width, height, bits = struct.unpack_from("<hhB", data, 12)  # signed, as in Mitsuba
     depth = max(bits // 8, 1)
+    if (kind & 7, bits) not in ((2, 24), (2, 32), (3, 8)):
+        raise _refused("its colours are indexed" if kind & 7 == 1 else f"its bit depth is {bits}")
     if kind & 8 and min(width, height) > 0 and width * height * depth <= MOST_VALUES:
         file.seek(18 + skipped)
         _check_runs(file.read(), width * height, depth)
@@ -319,7 +327,7 @@ def _check_chunks(file: IO[bytes]) -> None:
 
 
 def _jpeg(_: bytes, file: IO[bytes]) -> Sizes:
-    """Return the size. Raise `InputError` for too many scans, and where a file ends before its picture, which libjpeg fills with grey.
+    """Return the size. Raise `InputError` for too many scans, and for a file without end marker: libjpeg fills what is missing with grey.
 
     Thumbnails before the picture and videos after it do not count.
     """
@@ -336,7 +344,8 @@ def _jpeg(_: bytes, file: IO[bytes]) -> Sizes:
         scans += kind == _JPEG_SCAN
         at = start + max(int.from_bytes(data[start : start + 2], "big"), 2)
     else:
-        fault = f"more than {_MOST_SCANS} scans" if scans > _MOST_SCANS else "the file ends before the picture does"
+        fault = "it has no end marker, so a part may be missing; copy the file again, or save the picture again if it is complete"
+        fault = f"more than {_MOST_SCANS} scans" if scans > _MOST_SCANS else fault
         raise InputError(f"cannot be read as a picture: {fault}")
     if len(sizes) != 1:
         raise ValueError("no frame, or several")
@@ -346,13 +355,20 @@ def _jpeg(_: bytes, file: IO[bytes]) -> Sizes:
     return sizes
 
 
+def _mitsubas_jpeg(data: bytes, file: IO[bytes]) -> Sizes:
+    ((width, height, channels),) = _jpeg(data, file)
+    if channels not in (1, 3):
+        raise _refused("its colours are CMYK" if channels == 4 else f"it has {channels} channels")
+    return [(width, height, channels)]
+
+
 _MITSUBA: tuple[_Kind, ...] = (
     (b"BM", "BMP", _mitsubas_bmp),
     (b"#?", "HDR", _hdr),
     (b"PF", "PFM", _pfm),
     (b"Pf", "PFM", _pfm),
     (b"P6", "PPM", _ppm),
-    (b"\xff\xd8", "JPEG", _jpeg),
+    (b"\xff\xd8", "JPEG", _mitsubas_jpeg),
     (b"\x89PNG\r\n\x1a\n", "PNG", _png),
     (b"\x76\x2f\x31\x01", "EXR", _exr),
     (b"", "TGA", _mitsubas_tga),
@@ -360,7 +376,8 @@ _MITSUBA: tuple[_Kind, ...] = (
 """Kinds of files that Mitsuba's `Bitmap` may decode."""
 
 _PHOTOGRAPHS: tuple[_Kind, ...] = (
-    *(each for each in _MITSUBA if each[1] not in ("BMP", "PPM", "TGA")),
+    *(each for each in _MITSUBA if each[1] not in ("BMP", "JPEG", "PPM", "TGA")),
+    (b"\xff\xd8", "JPEG", _jpeg),
     (b"BM", "BMP", _bmp),
     *((magic, "TIFF", tiff_header.read) for magic in tiff_header.MAGICS),
     (b"RIFF", "WEBP", _webp),

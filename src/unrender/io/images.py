@@ -102,8 +102,16 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
     Raises `InputError` for a file whose EXIF orientation turns or mirrors its pixels, and for one that was `linearised` from sRGB but
     declares another gamma.
     """
+    faults, profile = metadata(source, linearised)
+    if faults:
+        raise InputError(f"{source}: {faults[0]}")
+    return f"{Path(source).name}: {profile}" if profile else ""
+
+
+def metadata(source: Any, linearised: bool) -> tuple[list[str], str]:
+    """Return what `check_metadata` refuses, and its line about the colour profile, both without the file's name."""
     if not isinstance(source, (str, Path)) or Path(source).suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        return ""
+        return [], ""
     path = Path(source)
     try:
         with warnings.catch_warnings():
@@ -114,16 +122,17 @@ def check_metadata(source: Any, linearised: bool = False) -> str:
                 srgb, turned = is_srgb(picture.info.get("icc_profile"), exif_of(picture)), orientation(picture)
                 gamma = other_gamma(picture)
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
-        return ""
+        return [], ""
+    faults = list[str]()
     if turned != 1:
-        raise InputError(
-            f"{path}: its EXIF orientation is {turned}, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
+        faults.append(
+            f"its EXIF orientation is {turned}, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
         )
     if linearised and gamma:
-        raise InputError(
-            f"{path}: it declares a gamma of {gamma:.3g}, that of sRGB is 0.455; convert it to sRGB, or to floating-point .exr"
+        faults.append(
+            f"it declares a gamma of {gamma:.3g}, that of sRGB is 0.455; convert it to sRGB, or to floating-point .exr"
         )
-    return "" if srgb else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
+    return faults, "" if srgb else "its colour profile is not sRGB and is ignored; convert the file to sRGB"
 
 
 def other_gamma(picture: Image.Image) -> float:

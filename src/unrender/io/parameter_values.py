@@ -12,7 +12,8 @@ Files are converted as Mitsuba converts a file of the scene. The scene's own fil
 
 Values of a texture in half precision are rounded. Meshes are loaded with the settings of the shape. They need the same vertices in the
 same order, with Mitsuba's duplicates at seams. A picture or grid of another resolution is resized, with a note. A colour picture fills a
-one-channel texture by its luminance, a grey one all channels.
+one-channel texture by its luminance, a grey one all channels. A notice tells of an EXIF orientation, another gamma or another profile,
+which Mitsuba ignores.
 """
 
 from __future__ import annotations
@@ -150,6 +151,8 @@ def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
     height, width, channels = conversion.picture_shape(shape)
     values, remarks = picture.values, [picture.notice.partition(": ")[2]] if picture.notice else []
+    faults, profile = images.metadata(path, bool(picture.notice))
+    remarks += [*faults, profile] if profile and picture.notice else faults
     if channels == 1 and values.shape[2] == 3:
         values = images.luminance(values)
         remarks.append("reduced to its luminance")
