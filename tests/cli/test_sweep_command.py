@@ -120,7 +120,18 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
 def test_a_sweep_whose_problem_has_changed_is_not_continued(unrender, problem: Path, mitsuba_variant: str) -> None:
     over = ["--over", "learning_rate=0.001:0.1:log", "--search", "random", "--trials", 1, "--steps", 2]
     over += ["--final-spp", 2, "--variant", mitsuba_variant, "--out", "s"]
+    text = problem.read_text().replace("truth = [0.6", "initial = 0.3\ntruth = [0.6")
+    problem.write_text(text)
     assert unrender("sweep", "problem.toml", "-m", "plain", *over).status == 0
+    for old, new, change in (
+        ("0.3", "0.25", "initial has changed"),
+        ("[0.6", "[0.5", "truth has changed"),
+        ("0.3", "0.3\nlearning_rate = 0.5", "learning_rate was None, is 0.5"),
+    ):
+        problem.write_text(text.replace(old, new))
+        answer = unrender("sweep", "s", "--trials", 2)
+        assert answer.refuses(f"trial 0: parameter wall.bsdf.reflectance.value: {change}; begin another sweep")
+    problem.write_text(text)
     assert unrender("sweep", "s", "--trials", 2).status == 0
     mi.Bitmap(np.ones((4, 6, 3), np.float32)).write("photo.exr")
     answer = unrender("sweep", "s", "--trials", 3)

@@ -43,15 +43,15 @@ from unrender.display.terminal import Console, columns
 from unrender.io import files
 from unrender.runs.budget import few_steps
 from unrender.runs.folder.lock import Lock
-from unrender.runs.folder.reader import read_run_record
 from unrender.runs.folder.schema import DOUBTFUL, ENDED, RECORD
 from unrender.runs.result import TERMINATED as BY_SIGTERM
-from unrender.scene.fingerprint import differences, fingerprint, shortened
+from unrender.scene.fingerprint import differences, digest, fingerprint, shortened
 from unrender.scene.problem import Problem
 
 _SHOWN = 10
-_PART = re.compile(r"file |loss|max_depth|view |expression of|parameter .*: bounds")
-"""Parts of a fingerprint that the files of a problem decide alone."""
+_COMPUTED = re.compile(r"scene|value of the expression")
+"""Parts of a fingerprint that a device computes from other parts."""
+_LONGEST_PART = 200
 _MANY = 1e9  # degrees of freedom of a standard error that is known
 
 
@@ -208,7 +208,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
             for path in session.folder.glob(RUN_FOLDERS):
                 files.remove(path)
         if not trials.done:
-            with _executor(console, session, record) as (executor, job, problem, running):
+            with _executor(console, session, state) as (executor, job, problem, running):
                 introduce(console, problem, running)
                 _choose_window(state, executor)
                 _announce(console, session, state, executor)
@@ -242,9 +242,9 @@ def _choose_window(state: _State, executor: Executor) -> None:
 
 
 @contextlib.contextmanager
-def _executor(console: Console, session: Session, record: SweepRecord) -> Iterator[tuple[Executor, Job, Problem, str]]:
-    """Yield the executor of the trials, their common data, the problem, and the variant."""
-    plan = record.plan
+def _executor(console: Console, session: Session, state: _State) -> Iterator[tuple[Executor, Job, Problem, str]]:
+    """Yield the executor of the trials, their common data, the problem, and the variant. Stores the problem's definition in the record."""
+    record, plan = state.record, state.record.plan
     with contextlib.ExitStack() as stack:
         cluster = None
         if session.workers is not None:
@@ -253,7 +253,9 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
                 check_threads(session.threads)
         running = arguments.use_variant(plan.variant, None if cluster else session.threads)
         problem = arguments.open_problem(plan.problem, plan.problem_settings, plan.cached)
-        _check_unchanged(session.folder, problem)
+        state.record = record = record.model_copy(
+            update={"definition": _checked_definition(session.folder, record, problem)}
+        )
         if plan.final_spp == 1 and not problem.has_truth:
             raise InputError(
                 "--final-spp: expected 2 or more, since trials without a truth are ranked by final pictures"
@@ -275,17 +277,23 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
             yield InProcess(lambda job, runs: (tasks.in_turn(job, runs, problem), {})), job, problem, running
 
 
-def _check_unchanged(folder: Path, problem: Problem) -> None:
-    """Raise `InputError` if a problem file, its scene or its pictures have changed since the first run of a sweep, whose error was another
-    one. Parts that a method or a device changes do not count."""
-    first = next((run for run in sorted(folder.glob(RUN_FOLDERS)) if (run / RECORD).is_file()), None)
-    before = None if first is None else read_run_record(first).problem.fingerprint
-    if before is None or "file" not in problem.origin:
-        return
-    both = ({part: x for part, x in of.items() if _PART.match(part)} for of in (before, fingerprint(problem)))
-    if changes := differences(*both):
+def _checked_definition(folder: Path, record: SweepRecord, problem: Problem) -> dict[str, str]:
+    """Return the parts of a problem that its files define. Raise `InputError` if one has changed since the first run of the sweep, whose
+    error was another one."""
+    if "file" not in problem.origin:
+        return {}
+    parts = {part: text for part, text in fingerprint(problem).items() if not _COMPUTED.match(part)}
+    for key, unknown in problem.unknowns.items():
+        if unknown.parameter.initial is None:  # the scene's, of which the files are parts
+            del parts[f"parameter {key}: initial"]
+        if unknown.truth is not None:
+            parts[f"parameter {key}: truth"] = digest(unknown.truth.tobytes())
+    parts = {part: text if len(text) <= _LONGEST_PART else digest(text.encode()) for part, text in parts.items()}
+    begun = any((run / RECORD).is_file() for run in folder.glob(RUN_FOLDERS))
+    if begun and record.definition and (changes := differences(record.definition, parts)):
         what = f"its problem has changed since trial 0: {shortened(changes)}"
         raise InputError(f"sweep {folder}: {what}; begin another sweep, or take the change back")
+    return parts
 
 
 def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:

@@ -125,6 +125,7 @@ class SweepRecord(BaseModel):
 
     Attributes:
         status: "running", "finished" or "interrupted".
+        definition: {part of the problem: its text or hash} when the first trial started; empty for problems without a file.
         best: number of the finished trial with the least error; None before a trial has finished.
         best_line: the settings of that trial, as they are typed; "" before a trial has finished.
         wall_seconds: duration of all sessions so far.
@@ -137,6 +138,7 @@ class SweepRecord(BaseModel):
     status: Literal["running", "finished", "interrupted"] = "running"
     command: StrictStr = ""
     plan: SweepPlan
+    definition: dict[_Text, _Text] = {}
     best: _Count | None = None
     best_line: StrictStr = ""
     wall_seconds: FiniteFloat = 0.0
