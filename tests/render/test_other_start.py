@@ -1,4 +1,4 @@
-"""Runs of few numbers leave a second minimum for better values, and a descent that arrives is not disturbed."""
+"""Runs leave a second minimum for better values of few numbers, and for other turns of shapes; a descent that arrives is not disturbed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import unrender as ur
 from tiers import slow
 from unrender.core.errors import InputError
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods import method
 from unrender.methods.plan import Plan
+from unrender.methods.rules.turns import better_turn, turns
 
 pytestmark = pytest.mark.mitsuba
 
@@ -76,3 +79,90 @@ def test_a_plan_keeps_the_keys_of_other_starts() -> None:
     assert Plan.from_table(made, table, "plan").other_starts == (KEY,)
     with pytest.raises(InputError, match="other_starts: expected a list of unknowns"):
         Plan.from_table(made, table | {"other_starts": ["lamp"]}, "plan")
+
+
+TURN = "block.rotation.y"
+
+
+def room(resolution: int = 24) -> dict[str, Any]:
+    """A block of unequal sides on a floor, in the light of a lamp and a sky, seen from two sides."""
+    to_world = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
+    texture = np.random.default_rng(2).uniform(0.2, 0.8, (8, 8, 3)).astype(np.float32)
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True}
+    views = {
+        f"cam{number}": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": to_world().look_at([side, 2, 2.5], [0, 0.2, 0], [0, 1, 0]),
+            "film": film,
+        }
+        for number, side in enumerate((-1.0, 1.5))
+    }
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        **views,
+        "floor": {
+            "type": "rectangle",
+            "to_world": to_world().rotate([1, 0, 0], -90).scale(1.5),
+            "bsdf": {"type": "diffuse", "reflectance": picture},
+        },
+        "block": {
+            "type": "cube",
+            "to_world": to_world().translate([0, 0.3, 0]).scale([0.5, 0.3, 0.25]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.15]}},
+        },
+        "lamp": {"type": "point", "position": [1.0, 2, 1], "intensity": {"type": "rgb", "value": 6.0}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    }
+
+
+def turned(initial: float) -> ur.Problem:
+    scene = mi.load_dict(room())
+    views = [ur.View(np.array(mi.render(scene, sensor=sensor, spp=256)), sensor=sensor) for sensor in (0, 1)]
+    unknowns = [ur.Parameter(TURN, initial=initial), ur.Parameter("floor.bsdf.reflectance.data", initial=0.5)]
+    return ur.Problem(room(), unknowns, views, max_depth=3)
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_other_turns(tmp_path: Path) -> None:
+    made = turned(1.9)
+    plan = method("auto").plan(made)
+    assert plan.other_starts == (TURN,)
+    result = ur.optimize(made, plan, steps=50, run_directory=tmp_path / "whole", checkpoint_every=10)
+    assert np.sin(result.last[TURN]) == pytest.approx(0.0, abs=0.03), "the block is symmetric under half a turn"
+    line = f"begins again after step 20 with other turns of {TURN}"
+    assert any(line in told for told in result.adapted)
+    resumed = ur.resume(tmp_path / "whole", made, steps=51)
+    assert any(line in told for told in resumed.adapted)
+
+
+@pytest.mark.parametrize(("angle", "best"), [(np.pi / 2, 0.0), (-np.pi / 2 + 0.05, 0.05), (0.0, None), (np.pi, None)])
+def test_the_best_turn_is_that_nearest_to_the_initial_one(angle: float, best: float | None) -> None:
+    made = turned(0.3)
+    values = made.initial() | {TURN: np.float32(angle)}
+    place = better_turn(made, FreshPictures(made, 0, 1 << 16), {k: np.asarray(x) for k, x in values.items()}, (TURN,))
+    if best is None:
+        assert place is None
+    else:
+        assert place is not None
+        assert place.values[TURN] == pytest.approx(best, abs=1e-5)
+        assert 0 < place.share < 1
+
+
+@pytest.mark.slow
+def test_a_shape_that_arrives_is_not_turned() -> None:
+    result = ur.optimize(turned(0.3), steps=50)
+    assert result.last[TURN] == pytest.approx(0.0, abs=0.03)
+    assert not any("begins again" in line for line in result.adapted)
+
+
+def test_turns_are_compositions_of_rotations() -> None:
+    vector = np.array([0.3, -1.1, 0.5])
+    quarters = [Rotation.from_rotvec(angle * axis) for axis in np.eye(3) for angle in np.pi / 2 * np.array([1, 2, 3])]
+    for turn, quarter in zip(turns(vector), quarters, strict=True):
+        expected = (quarter * Rotation.from_rotvec(vector)).as_matrix()
+        np.testing.assert_allclose(Rotation.from_rotvec(turn).as_matrix(), expected, atol=1e-6)
+    angles = np.array(turns(np.array(0.5)))
+    np.testing.assert_allclose(np.exp(1j * (angles - 0.5)), np.exp(0.25j * np.pi * np.arange(1, 8)), atol=1e-6)

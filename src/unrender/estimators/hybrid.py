@@ -78,10 +78,9 @@ class HybridState:
         )
 
     def restarted(self, fresh: HybridState) -> HybridState:
-        """Return the restarted state, with the restarted states of both estimators."""
-        return replace(
-            fresh, path=restarted(self.path, fresh.path), perturbed=restarted(self.perturbed, fresh.perturbed)
-        )
+        """Return the restarted state, with the restarted states of both estimators. A block does not wait again."""
+        parts = {name: restarted(getattr(self, name), getattr(fresh, name)) for name in ("path", "perturbed")}
+        return replace(fresh, **parts, step=fresh.step if fresh.mean else self.step)
 
 
 @register

@@ -17,7 +17,8 @@ from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.methods.rules.starts import better_place, number_of_places
+from unrender.methods.rules.starts import Place, better_place, number_of_places
+from unrender.methods.rules.turns import better_turn, number_of_turns
 from unrender.optimizers.partitioned import Partitioned
 from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Remeshable, ReplacedMesh
@@ -201,35 +202,61 @@ _NUMBER, _KEPT = 4, "kept"  # index of the set of random numbers; outcome of a c
 
 
 class OtherStart(Callback):
-    """Callback that continues a run of few numbers from other values where its picture stays different from the references.
+    """Callback that continues a run from other values where these have a better picture.
 
-    A descent ends in the nearest minimum. After 40 % of the budget, a new picture is compared with the references. If they differ by more
-    than noise, pictures of other values of `Plan.other_starts` are rendered. The run begins again at the best ones only if their loss is
-    at most half of that of the descent so far, beyond noise. A descent that arrives is therefore not disturbed.
+    A descent ends in the nearest minimum. After 40 % of the budget, a new picture of few numbers is compared with the references. If they
+    differ by more than noise, pictures of other values of `Plan.other_starts` are rendered. The run begins again at the best ones only if
+    their loss is at most half of that of the descent so far, beyond noise. A descent that arrives is therefore not disturbed.
+
+    Of shapes beside textures (`Partitioned`), other turns are compared at the same instant, and any smaller loss is enough, beyond noise.
+    The block of the poses begins again there; textures and lights go on.
     """
 
     def before_step(self, run: Run) -> None:
-        state, problem = run.state, run.problem
-        if not run.plan.other_starts or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
+        state, keys = run.state, run.plan.other_starts
+        if not keys or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
             return
-        places = number_of_places(problem, run.plan.other_starts)
+        block = isinstance(run.optimizer, Partitioned)
+        places = (number_of_turns if block else number_of_places)(run.problem, keys)
         paths = max(_SHARE / places * state.samples, _LEAST_PATHS)
-        pictures = FreshPictures(problem, run.seed, paths, _NUMBER)
-        if problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
+        pictures = FreshPictures(run.problem, run.seed, paths, _NUMBER)
+        if run.problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
-        state.other_start, values = _KEPT, run.full()
-        if not misfit_of_numbers(problem, pictures.compare(pictures.picture(values).images)):
-            return
-        keys, known = run.plan.other_starts, problem.renderer.parameters()
-        lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]
-        if place := better_place(problem, pictures, values, keys, lights):
-            begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})
-            state.numbers = NumberTrace()
-            state.other_start = (
-                f"{BEGUN_AGAIN} {run.step} with other values of {listed(list(keys))}, where the loss is {place.share:.0%} of that "
-                "of the descent so far"
-            )
+        state.other_start = (_turned if block else _moved)(run, pictures) or _KEPT
 
     def on_result(self, run: Run, result: Result) -> Result:
         line = run.state.other_start
         return replace(result, adapted=[*result.adapted, line]) if line not in ("", _KEPT) else result
+
+
+def _moved(run: Run, pictures: FreshPictures) -> str:
+    """Begin again at other values with a much better picture. Returns a line about them, or ""."""
+    problem, values, keys = run.problem, run.full(), run.plan.other_starts
+    if not misfit_of_numbers(problem, pictures.compare(pictures.picture(values).images)):
+        return ""
+    known = problem.renderer.parameters()
+    lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]
+    if not (place := better_place(problem, pictures, values, keys, lights)):
+        return ""
+    begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})
+    run.state.numbers = NumberTrace()
+    return f"{BEGUN_AGAIN} {run.step} with other values of {listed(list(keys))}, {_loss(place)}"
+
+
+def _turned(run: Run, pictures: FreshPictures) -> str:
+    """Let the block of poses begin again where shapes are turned, if that picture is better. Returns a line about it, or ""."""
+    problem, state, optimizer = run.problem, run.state, run.optimizer
+    if not (place := better_turn(problem, pictures, run.full(), run.plan.other_starts)):
+        return ""
+    assert isinstance(optimizer, Partitioned)
+    run.parameters = {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}}
+    arrays.evaluate(run.parameters)
+    fresh = optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
+    state.optimizer = optimizer.restarted(state.optimizer, fresh, optimizer.keys)
+    state.estimator = restarted(state.estimator, run.estimator.init(problem, run.parameters))
+    state.numbers, state.noise = NumberTrace(), GradientNoise()
+    return f"{BEGUN_AGAIN} {run.step} with other turns of {listed(list(place.values))}, {_loss(place)}"
+
+
+def _loss(place: Place) -> str:
+    return f"where the loss is {place.share:.0%} of that of the descent so far"

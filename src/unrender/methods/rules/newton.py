@@ -25,6 +25,7 @@ from unrender.methods.base import measure
 from unrender.methods.plan import Plan
 from unrender.methods.rules.starts import best_start, stands_out
 from unrender.methods.rules.traits import Traits, choose_sampler, samples_per_pixel, within
+from unrender.methods.rules.turns import turned_keys
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.partitioned import Partitioned, Successive
@@ -133,7 +134,8 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     traced = images * estimator.derivative_spp + estimator.spp
     every = within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
     # A texture that is fitted to a picture of a wrong lamp, lens or camera takes over its error.
-    wait = constants.block_wait if any(traits.infos[key].shape_pose for key in keys) else 0
+    shapes = any(traits.infos[key].shape_pose for key in keys)
+    wait = constants.block_wait[any(key not in keys for key in traits.lights)] if shapes else 0
     optimizer = _optimizer(traits, keys)
     if any(traits.infos[key].rigid and traits.infos[key].viewpoint for key in keys):
         optimizer, every = replace(optimizer, trust_radius=constants.camera_trust), 1
@@ -147,6 +149,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
         estimator=HybridGradient(plan.estimator, estimator, keys, wait=wait, every=every, eliminated=eliminated),
         optimizer=Partitioned(keys, optimizer, plan.optimizer),
         reasons=(reason, *plan.reasons),
+        other_starts=turned_keys(problem, keys),
     )
     return best_start(traits, keys, made)
 

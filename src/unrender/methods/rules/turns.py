@@ -1,0 +1,103 @@
+"""Turns of shapes: a descent of a pose ends in the nearest minimum, which may be a quarter turn away from the best one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.methods.rules.starts import Place
+from unrender.scene.problem import Problem
+from unrender.statistics.paired_losses import difference, mean_and_error
+
+_TURNS = 8  # number of compared angles of a rotation about one axis; of a rotation vector, half as many about each axis
+_ERRORS, _EQUAL = 4.0, 2.0
+"""Standard errors of the difference of two losses beyond which another turn is taken, and within which two turns are equally good."""
+
+
+def turned_keys(problem: Problem, keys: Sequence[str]) -> tuple[str, ...]:
+    """Return the rotations of shapes among some unknowns, without those that have bounds, a prior or a parameterisation."""
+    known, unknowns = problem.renderer.parameters(), problem.unknowns
+    return tuple(
+        key
+        for key in keys
+        if known[key].shape_pose and known[key].angle and unknowns[key].bounds == (None, None)
+        if unknowns[key].prior is None and unknowns[key].transform is None
+    )
+
+
+def number_of_turns(problem: Problem, keys: Sequence[str]) -> int:
+    """Return how many pictures `better_turn` compares at most, that of the given values included."""
+    return 1 + sum(len(turns(problem.unknowns[key].initial)) for key in keys)
+
+
+def better_turn(
+    problem: Problem, pictures: FreshPictures, values: Mapping[str, np.ndarray], keys: Sequence[str]
+) -> Place | None:
+    """Return the turn of the least loss, key by key; None unless its loss is smaller than that of the given values beyond noise.
+
+    Of turns that are equally good, as those of a symmetric shape are, the one nearest to the initial value is taken.
+
+    Args:
+        problem: Problem of the run.
+        pictures: Renderer of the pictures.
+        values: {key: array}, the values of all unknowns.
+        keys: Keys of rotations, see `turned_keys`.
+    """
+    first = best = pictures.losses(pictures.images(values))
+    chosen: dict[str, np.ndarray] = {}
+    for key in keys:
+        initial, better = problem.unknowns[key].initial, []
+        for turn in sorted(turns(values[key]), key=partial(_distance, initial)):
+            try:
+                losses = pictures.losses(pictures.images({**values, **chosen, key: turn}))
+            except InputError:  # a value that the renderer rejects
+                continue
+            change = difference(losses, best, sampled=pictures.sampled)
+            if change.value > _ERRORS * change.standard_error:
+                better.append((turn, losses))
+        if better:
+            least = min((losses for _, losses in better), key=lambda losses: mean_and_error(losses)[0])
+            chosen[key], best = next(each for each in better if _is_as_good(each[1], least, pictures.sampled))
+    start, total = mean_and_error(first)[0], mean_and_error(best)[0]
+    return Place(chosen, max(total, 0.0) / start, total) if chosen and start > 0.0 else None
+
+
+def _is_as_good(losses: np.ndarray, least: np.ndarray, sampled: bool) -> bool:
+    change = difference(least, losses, sampled=sampled)
+    return losses is least or change.value <= _EQUAL * change.standard_error
+
+
+def turns(value: np.ndarray) -> list[np.ndarray]:
+    """Return other turns of a rotation: of one angle, in steps of 45°; of a rotation vector (3,), by 90°, 180° and 270° about each
+    axis. Angles are in radians, within a full turn."""
+    if value.size == 1:
+        angles = np.ravel(value)[0] + 2 * math.pi / _TURNS * np.arange(1, _TURNS)
+        return [np.full(value.shape, math.remainder(angle, 2 * math.pi), np.float32) for angle in angles]
+    quarters = [4 * math.pi / _TURNS * number for number in range(1, _TURNS // 2)]
+    return [_composed(angle * axis, value) for axis in np.eye(3) for angle in quarters]
+
+
+def _distance(initial: np.ndarray, turn: np.ndarray) -> float:
+    """Return the angle between two rotations in radians."""
+    if turn.size == 1:
+        return abs(math.remainder(np.ravel(turn)[0] - np.ravel(initial)[0], 2 * math.pi))
+    return float(np.linalg.norm(_composed(turn, -initial)))
+
+
+def _composed(second: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the rotation vector of a rotation after another, (3,), by quaternions."""
+    (a, u), (b, v) = _quaternion(second), _quaternion(first)
+    real, imaginary = a * b - u @ v, a * v + b * u + np.cross(u, v)
+    sine = float(np.linalg.norm(imaginary))
+    angle = 2 * math.atan2(sine, abs(real))
+    return (math.copysign(angle / max(sine, 1e-12), real) * imaginary).astype(np.float32)
+
+
+def _quaternion(vector: np.ndarray) -> tuple[float, np.ndarray]:
+    angle = float(np.linalg.norm(vector))
+    return math.cos(angle / 2), np.asarray(vector, np.float64) * (math.sin(angle / 2) / max(angle, 1e-12))
