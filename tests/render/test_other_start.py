@@ -158,6 +158,13 @@ def test_a_shape_that_arrives_is_not_turned() -> None:
     assert not any("begins again" in line for line in result.adapted)
 
 
+def test_a_block_that_has_not_moved_is_named() -> None:
+    result = ur.optimize(turned(0.3), steps=3)
+    assert result.parameters[TURN] == np.float32(0.3)
+    told = f"{TURN}: still at the initial values after 3 steps, since the first 8 are steps of the others"
+    assert any(line.startswith(told) for line in result.warnings)
+
+
 def test_turns_are_compositions_of_rotations() -> None:
     vector = np.array([0.3, -1.1, 0.5])
     quarters = [Rotation.from_rotvec(angle * axis) for axis in np.eye(3) for angle in np.pi / 2 * np.array([1, 2, 3])]

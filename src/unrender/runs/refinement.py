@@ -17,6 +17,7 @@ from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.methods.rules.starts import Place, better_place, number_of_places
 from unrender.methods.rules.turns import better_turn, number_of_turns
 from unrender.optimizers.partitioned import Partitioned
@@ -60,8 +61,14 @@ def is_due(run: Run) -> bool:
 
 
 def unfinished(run: Run) -> list[str]:
-    """Return one line for each parameter that did not reach its scene's resolution."""
-    lines = []
+    """Return one line for each parameter that did not reach its scene's resolution, and one for a block that has not moved."""
+    lines, estimator = [], run.estimator
+    if isinstance(estimator, HybridGradient) and 0 < run.step <= estimator.wait:
+        block = estimator.keys or beyond_paths(run.problem.renderer.parameters(), list(run.parameters))
+        lines.append(
+            f"{listed(list(block))}: still at the initial values after {run.step} steps, since the first {estimator.wait} "
+            "are steps of the others; use more steps or seconds"
+        )
     for key, levels in run.problem.coarse_to_fine.items():
         if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and levels.steps[-1] < NEVER:
             size = "x".join(map(str, reversed(shape[:-1])))
