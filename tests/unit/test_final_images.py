@@ -32,7 +32,7 @@ from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.numbers import TOO_SHORT
 from unrender.runs.optimize import optimize
-from unrender.runs.reference_distortions import misplaced
+from unrender.runs.reference_distortions import misplaced, unequal_brightness
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 from unrender.runs.verification import NOISE, PRIOR, SMOOTH, STEPS, STEPS_OF_FEW, Misfit, fit_status
@@ -494,6 +494,31 @@ def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: s
         fitted = [[0.95 * view.reference + 0.05 * of[1] for _ in of] for view, of in zip(views, ends, strict=True)]
         assert misplaced(made, (0, 1), ends, ends) == expected  # type: ignore[arg-type]
         assert not misplaced(made, (0, 1), ends, fitted)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("factors", "shift", "words"),
+    [
+        ((1.0, 1.5, 1.2), 0, "as if the reference of view 1 were 1.5 times as bright as that of view 0"),
+        ((0.9, 1.0, 0.5), 0, "as if the reference of view 1 were 2 times as bright as that of view 2"),
+        ((1.0, 1.1, 1.0), 0, ""),
+        ((1.3, 1.3, 1.3), 0, ""),
+        ((1.0, 1.3, 1.0), 6, ""),
+    ],
+)
+def test_references_of_unequal_brightness_are_named(factors: tuple[float, ...], shift: int, words: str) -> None:
+    """Exposures that differ were said to be wrong light or depth."""
+    random = np.random.default_rng(4)
+    images = [0.2 + scipy.ndimage.gaussian_filter(random.random((24, 24, 3)), (1.5, 1.5, 0.0)) for _ in factors]
+    for image in images:
+        image[:, :8] *= 4.0
+    references = [factor * np.roll(x, shift, 1) for factor, x in zip(factors, images, strict=True)]
+    ends = [[1.1 * x + random.normal(0.0, 0.02, x.shape) for _ in range(2)] for x in images]
+    ends[1][0][5, 5] = np.nan
+    made: Any = SimpleNamespace(
+        views=[SimpleNamespace(reference=x) for x in references], test_weights=lambda *of: np.ones((24, 24))
+    )
+    assert unequal_brightness(made, range(len(factors)), ends) == words
 
 
 def misplaced_among(references: list[np.ndarray], images: list[np.ndarray], weights: np.ndarray) -> str:

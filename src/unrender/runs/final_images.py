@@ -36,10 +36,10 @@ from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_key
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
-from unrender.runs.reference_distortions import AS_IF, misplaced
+from unrender.runs.reference_distortions import AS_IF, misplaced, unequal_brightness
 from unrender.runs.result import Result
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS
-from unrender.runs.verification import DIFFERS, SMOOTH, Misfit, misfit_of_views
+from unrender.runs.verification import DIFFERS, SMOOTH, STEPS, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -168,12 +168,15 @@ def render_final_images(
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
     few = result.steps < (FEW_NEWTON_STEPS if complete else FEW_STEPS)  # lights may still be far from their values
     words = "" if few else misplaced(problem, chosen, halves_of["initial"], ends)
+    sure = [x for x in (differs, result.misfit) if x and STEPS not in x.causes and AS_IF not in x.line]
+    if sure and not words and not few:
+        words = unequal_brightness(problem, chosen, ends)
     texts, differs = _named([*lines, *maps.limited], differs, words)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 
 
 def _named(lines: Sequence[str], differs: Misfit | None, words: str) -> tuple[tuple[str, ...], Misfit | None]:
-    """Return lines without those that a difference makes superfluous, and the difference; `words` are of `misplaced`."""
+    """Return lines without those that a difference makes superfluous, and the difference; `words` name references."""
     if words:
         differs = differs and replace(differs, explanation=f"{differs.explanation}; they look {words}")
         lines = [*lines, f"the pictures look {words}; check the references"]

@@ -40,7 +40,8 @@ _BETTER, _CLEARLY, _MOST_VIEWS, _SIDE = 0.5, 0.1, 32, 64
 shares. Of 1160 comparisons at the starts of right scenes, the least share was 0.87 and the largest difference 0.09 where no unknown moves
 what is seen. Most views whose references are compared with each other; most pixels of a side of the compared images."""
 _MOSTLY, _BRIGHTER = 0.5, 0.15
-"""Share of the squares of a residual from which a distortion that explains them is named; least relative change of brightness."""
+"""Share of the squares of a residual from which a distortion that explains them is named; least relative change, or difference between
+views, of brightness."""
 
 
 def distortions(image: np.ndarray, reference: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
@@ -160,6 +161,30 @@ def misplaced(
     return " and ".join(
         f"{AS_IF}{'s' * (len(of) > 1)} {listed([*map(str, of)])} {words}" for words, of in found.items()
     )
+
+
+def unequal_brightness(problem: Problem, views: Sequence[int], ends: Sequence[Sequence[np.ndarray]]) -> str:
+    """Return words about the views of the darkest and the brightest reference relative to their pictures, as exposures that differ cause
+    them; "" unless one factor for each view explains most of the difference, and both halves of the pictures of the end tell the same.
+    """
+    factors, explained, total = [], 0.0, 0.0
+    for view, images in zip(views, ends, strict=True):
+        one, other = np.mean(images[0::2], axis=0), np.mean(images[1::2], axis=0)
+        reference = np.asarray(problem.views[view].reference, np.float64)
+        weights = problem.test_weights(view, images)[..., None] * np.isfinite(one + other)
+        one, other, reference = (np.where(weights > 0.0, x, 0.0) for x in (one, other, reference))
+        square = max(float((weights * one * other).sum()), 1e-300)
+        products = [float((weights * reference * half).sum()) for half in (one, other)]
+        factors.append([max(product, 0.0) / square for product in products])
+        explained += (sum(products) / 2 - square) ** 2 / square
+        total += float((weights * (reference - one) * (reference - other)).sum())
+    means = [max(sum(of) / 2, 1e-300) for of in factors]
+    dark, bright = int(np.argmin(means)), int(np.argmax(means))
+    least = min(factors[bright]) / max(*factors[dark], 1e-300)
+    if len(views) < 2 or not explained > _MOSTLY * total or not least > 1.0 + _BRIGHTER:
+        return ""
+    times = formatting.number(round(means[bright] / means[dark], 2))
+    return f"{AS_IF} {views[bright]} were {times} times as bright as that of view {views[dark]}"
 
 
 def _unexplained(image: np.ndarray, weights: np.ndarray, reference: np.ndarray) -> float:
