@@ -190,7 +190,8 @@ def test_a_lens_stays_positive() -> None:
 
 
 def test_numbers_that_mitsuba_compiles_have_a_next_step() -> None:
-    """The scale of a bump map multiplies its texture; scales of the sky have no such parameter."""
+    """The scale of a bump map or medium multiplies its texture or extinction; scales of the sky have no such parameter."""
+    fog = {"type": "heterogeneous", "sigma_t": {"type": "constvolume", "value": 0.5}, "scale": 2.0}
     to_scene = {
         "type": "scene",
         "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
@@ -204,9 +205,11 @@ def test_numbers_that_mitsuba_compiles_have_a_next_step() -> None:
                 "scale": 0.1,
             },
         },
+        "box": {"type": "cube", "bsdf": {"type": "null"}, "interior": fog},
     }
     for key, hint in (
         ("wall.bsdf.scale", "recover wall.bsdf.nested_texture.data in its place"),
+        ("box.interior_medium.scale", "recover box.interior_medium.sigma_t.value.value in its place"),
         ("sky.sky_scale", "run once for each of several values, and compare the losses"),
         ("sky.sun_scale", "run once for each of several values, and compare the losses"),
     ):

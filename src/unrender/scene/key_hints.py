@@ -12,7 +12,7 @@ from unrender.rendering.renderer import ParameterInfo
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")  # ids that Mitsuba generates for objects without one
 _OBJECT = re.compile(r"([^.]*(?:\.\d+)*)\.")
 _TRANSFORM = "to_world"
-_INSIDE = "nested_texture"  # slot of the texture of a bump map, which its scale multiplies
+_SCALED = "nested_texture", "sigma_t"  # slots that the scale of their owner multiplies: of bump maps and media
 _PLACES = (
     _TRANSFORM,
     "translation",
@@ -94,12 +94,13 @@ def _same_quantity(key: str, names: list[str]) -> list[str]:
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
     """Return a hint at a recoverable key in place of one that is not, or at what to do; "" if there is none.
 
-    The hint for a transformation is its pose, and for the scale of a bump map its texture. For other compiled numbers it is a run per
-    value.
+    The hint for a transformation is its pose, and for the scale of a bump map or medium its texture or extinction. For other compiled
+    numbers it is a run per value.
     """
     owner, _, rest = key.rpartition(".")
     if (info := known.get(key)) is not None and info.compiled:
-        inside = [name for name in known if name.startswith(f"{owner}.{_INSIDE}.") and known[name].perturbable]
+        slots = tuple(f"{owner}.{slot}." for slot in _SCALED)
+        inside = [name for name in known if name.startswith(slots) and known[name].perturbable and rest == "scale"]
         if inside:
             return f"; recover {inside[0]} in its place, which it multiplies"
         return "; set it in the scene file, run once for each of several values, and compare the losses"
