@@ -14,6 +14,7 @@ from unrender.core import checks
 from unrender.core.checks import Count, NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import in_words
 
 __all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]
 
@@ -144,7 +145,7 @@ class Warmup:
     def __post_init__(self):
         checks.fields(self)
         if self.then is not None and not callable(self.then):
-            raise InputError(f"Warmup: then must be a schedule or None, got {self.then!r}")
+            raise InputError(f"Warmup: then must be a schedule or None, got {in_words(self.then)}")
 
     def __call__(self, step: float) -> float:
         if step < self.steps:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import inspect
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +13,10 @@ import pytest
 from drjit.llvm.ad import Array3f
 
 from tests.analytic import AnalyticRenderer
-from unrender import losses
+from unrender import losses, methods
+from unrender.core import registry
 from unrender.core.errors import InputError
+from unrender.io import write_grid
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.parameter import Parameter
@@ -462,3 +467,43 @@ def test_parameters_of_arrays_can_be_compared() -> None:
     made = Parameter("wall.value", initial=np.ones(3))
     assert made == made
     assert made != Parameter("wall.value", initial=np.ones(3))
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(
+    "huge", [10**5000, [10**5000], {"a": 10**5000}, [10**400] * 3], ids=["number", "list", "table", "float"]
+)
+def test_integers_that_python_neither_prints_nor_converts_are_one_line(huge: Any, tmp_path: Path):
+    """As values of every argument and option. Python prints no more than 4300 digits, and a float has at most 308."""
+
+    def attempt(make: Any, *given: Any, **options: Any) -> None:
+        with contextlib.suppress(InputError):
+            make(*given, **options)
+
+    for name in inspect.signature(Parameter).parameters:
+        attempt(lambda name=name: problem([Parameter(**{"key": "wall.value", name: huge})]))
+    for name in inspect.signature(View).parameters:
+        attempt(lambda name=name: problem(views=[View(**{"reference": REFERENCE, name: huge})]))
+    for name in ("max_depth", "loss", "truth", "surfaces", "expressions", "name"):
+        attempt(problem, **{name: huge})
+    attempt(problem, truth={"wall.value": huge})
+    for name in ("parameters", "spp", "seed", "view", "per_pass"):
+        attempt(render, problem(), **{name: huge})
+    attempt(render, problem(), {"wall.value": huge})
+    attempt(write_grid, tmp_path / "a.vol", huge)
+    attempt(write_grid, tmp_path / "a.vol", np.ones((1, 1, 1)), [huge] * 6)
+    with pytest.raises(InputError, match="got list with an integer of more than 4300 digits"):
+        problem([Parameter("wall.value", initial=[10**5000])])
+    with pytest.raises(InputError, match="prior: near must have finite numbers"):
+        problem([Parameter("wall.value", prior={"near": 10**400, "std": 1})])
+    for method in map(methods.method, methods.methods()):
+        for name in method.options.model_fields:
+            attempt(method.configure, {name: huge})
+    tables = ("largest", "weights", "others")  # only mappings and components are taken
+    for made_by in (each for kind in registry.KINDS if kind != "method" for each in registry.components(kind).values()):
+        known = inspect.signature(made_by).parameters
+        needed = {
+            name: 1 for name, of in known.items() if of.default is of.empty and of.kind is of.POSITIONAL_OR_KEYWORD
+        }
+        for name in known.keys() - set(tables):
+            attempt(made_by, **{**needed, name: huge})

@@ -19,7 +19,7 @@ from typing import Any
 
 from unrender.backend import cache, install_hints, limits, llvm, plugins
 from unrender.core.errors import InputError, VariantError
-from unrender.core.text import did_you_mean, reason_of
+from unrender.core.text import did_you_mean, in_words, reason_of
 
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
@@ -155,7 +155,11 @@ def with_colours_of(variant: str, other: str | None) -> str:
 
 def unsupported(variant: str) -> str:
     """Return why a name is neither "auto" nor a supported variant, and what was expected, in one line; "" if it is."""
-    return "" if variant in ("auto", *VARIANTS) else f"{_lacking(str(variant))}{_EXPECTED}"
+    return (
+        ""
+        if variant in ("auto", *VARIANTS)
+        else f"{_lacking(variant if isinstance(variant, str) else in_words(variant))}{_EXPECTED}"
+    )
 
 
 def _lacking(variant: str) -> str:

@@ -87,14 +87,14 @@ def integer(owner: str, name: str, value: Any, at_least: int, at_most: int = (1 
 def flag(owner: str, name: str, value: Any) -> None:
     """Raise `InputError` unless `value` is true or false."""
     if type(value).__name__ not in ("bool", "bool_"):
-        raise InputError(f"{owner}: {name} must be true or false, got {value!r}")
+        raise InputError(f"{owner}: {name} must be true or false, got {in_words(value)}")
 
 
 def choice(owner: str, name: str, value: Any, *choices: str) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
     if not isinstance(value, str) or value not in choices:
         words = " or ".join(", ".join(f'"{each}"' for each in choices).rsplit(", ", 1))
-        raise InputError(f"{owner}: {name} must be {words}, got {value!r:.80}{did_you_mean(str(value), choices)}")
+        raise InputError(f"{owner}: {name} must be {words}, got {in_words(value)}{did_you_mean(value, choices)}")
 
 
 def fields(part: Any, owner: str = "") -> None:

@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 
 GROUP = "unrender.components"
 """The entry-point group."""
@@ -207,7 +207,7 @@ def state_modules() -> frozenset[str]:
 
 def _add(made_by: Any, name: str | None, kind: str | None, states: str | None, position: float | None) -> Any:
     if not isinstance(made_by, type):
-        raise InputError(f"register: expected a class, got {made_by!r:.80}")
+        raise InputError(f"register: expected a class, got {in_words(made_by)}")
     where = f"{made_by.__module__}.{made_by.__qualname__}"
     chosen = _detect(made_by, where) if kind is None else _check_kind(kind)
     parameters: Any = getattr(made_by, "__dataclass_params__", None)

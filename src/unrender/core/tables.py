@@ -21,7 +21,7 @@ import numpy as np
 from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.registry import GROUP
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
 _NEXT = "then"  # name of the field for the component after the word "then"
@@ -136,7 +136,7 @@ def options(made_by: type[_T], table: Any, example: str) -> _T:
     if isinstance(table, made_by):
         return table
     if not isinstance(table, Mapping):
-        raise InputError(f"expected a table such as {example}, got {table!r:.60}")
+        raise InputError(f"expected a table such as {example}, got {in_words(table)}")
     return build(made_by, table)
 
 
@@ -151,7 +151,7 @@ def _component(table: Any, kind: str | None, folder: Path | None, depth: int) ->
         example = f'{{ type = "{"Adam" if kind is None else next(iter(known), "Name")}" }}'
         expected = f"a table such as {example}"
         expected = expected if kind is None else f"{_one_of(known)}, or {expected}"
-        raise InputError(f"expected {expected}, got {repr(table)[:80]}")
+        raise InputError(f"expected {expected}, got {in_words(table)}")
     name = table[_TYPE]
     if name not in known:
         raise InputError(_unknown(name, kind, known))
@@ -164,7 +164,7 @@ def _build(made_by: type[_T], name: str, fields: Mapping[str, Any], folder: Path
     if _NONE not in known and (
         not isinstance(none, list) or any(not isinstance(key, str) or key not in known for key in none)
     ):
-        raise InputError(f"none: expected a list of fields of {name}, got {repr(none)[:80]}")
+        raise InputError(f"none: expected a list of fields of {name}, got {in_words(none)}")
     arguments: dict[str, Any] = {} if _NONE in known else dict.fromkeys(none)
     hints = _hints(made_by)
     for key, value in fields.items():

@@ -34,9 +34,16 @@ def shorten(text: str, longest: int) -> str:
 
 def in_words(value: Any) -> str:
     """Format a value for a message in at most 60 characters; an integer of more than 128 bits by their number."""
-    if isinstance(value, int) and value.bit_length() > 128:  # Python prints no integer of more than 4300 digits
+    if isinstance(value, int) and value.bit_length() > 128:
         return f"an integer of {value.bit_length()} bits"
-    return shorten(repr(value), 60)
+    return shorten(_represent(value), 60)
+
+
+def _represent(value: Any) -> str:
+    try:
+        return repr(value)
+    except ValueError:  # Python prints no integer of more than 4300 digits
+        return f"{type(value).__name__} with an integer of more than 4300 digits"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -77,7 +84,9 @@ def plain(text: str) -> str:
 
 def printable(value: Any) -> str:
     """Format an untrusted value on one line of at most 60 characters, with unprintable characters escaped; None as "nothing"."""
-    text = value if isinstance(value, str) and value.isprintable() else "nothing" if value is None else repr(value)
+    text = (
+        value if isinstance(value, str) and value.isprintable() else "nothing" if value is None else _represent(value)
+    )
     text = visible(text[:200])  # repr of an arbitrary type may be long or unprintable
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -112,13 +121,13 @@ _SYNONYMS = {
 """Terms of other packages and their equivalents here. A suggestion needs the equivalent to be among the known names."""
 
 
-def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
-    """Return "; did you mean X?" with the nearest known name, or "" if none has the `difflib` similarity `likeness`.
+def did_you_mean(name: Any, known: Iterable[str], likeness: float = 0.6) -> str:
+    """Return "; did you mean X?" with the nearest known name, or "" if none has the `difflib` similarity `likeness`, or `name` is no text.
 
     A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate), then one with two
     neighbouring letters exchanged (wiht for with). Only the first 1000 names of at most 200 characters are compared.
     """
-    if len(name) > _LONGEST:
+    if not isinstance(name, str) or len(name) > _LONGEST:
         return ""
     names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]

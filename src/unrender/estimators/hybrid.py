@@ -13,7 +13,7 @@ from unrender.core.checks import Count, Index
 from unrender.core.errors import InputError
 from unrender.core.random import WARM_UP, Key
 from unrender.core.registry import register
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator, pixel_weights
 from unrender.estimators.capabilities import (
@@ -143,7 +143,7 @@ class HybridGradient:
         checks.fields(self)
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
             raise InputError(
-                f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}"
+                f"HybridGradient: path must be an estimator, such as PathGradient(), got {in_words(self.path)}"
             )
         if isinstance(self.path, (SmoothedDerivatives, HybridGradient)) or Gradient.name not in self.path.provides:
             raise InputError(
@@ -159,7 +159,7 @@ class HybridGradient:
         ):
             raise InputError(
                 'HybridGradient: perturbed must be GaussNewton, or SmoothedDerivatives with order="gradient", since path gradients have no '
-                f"curvature, got {self.perturbed!r:.80}"
+                f"curvature, got {in_words(self.perturbed)}"
             )
         if self.averaged and Variance.name not in self.path.provides:
             raise InputError(
@@ -168,7 +168,7 @@ class HybridGradient:
         for name in ("keys", "eliminated") if self.keys is not None else ("eliminated",):
             keys: Any = getattr(self, name)
             if isinstance(keys, str) or not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
-                raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {keys!r:.80}")
+                raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {in_words(keys)}")
             object.__setattr__(self, name, tuple(keys))
         if isinstance(self.perturbed, GaussNewton):
             if self.eliminated and self.perturbed.remember:

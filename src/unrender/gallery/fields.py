@@ -9,7 +9,7 @@ from typing import Any
 
 from unrender.core import checks, registry, tables
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.losses import L2, Loss
 
 _LONGEST_SIDE = 1 << 13  # pixels along a side of an image with the largest number of values that is read from a file
@@ -65,7 +65,7 @@ def choice(default: str, about: str, among: tuple[str, ...]) -> Any:
 
     def check(owner: str, name: str, value: Any) -> str:
         if value not in among:
-            raise InputError(f"{owner}: {name} must be one of {', '.join(among)}, got {value!r}")
+            raise InputError(f"{owner}: {name} must be one of {', '.join(among)}, got {in_words(value)}")
         return value
 
     return field(default=default, metadata={"kind": str, "about": about, "check": check})
@@ -76,7 +76,7 @@ def _check_loss(owner: str, name: str, value: Any) -> Loss:
     if known is not None and known.kind == "loss":
         return value
     if not isinstance(value, (str, Mapping)):
-        raise InputError(f"{owner}: {name} must be one of unrender.losses or its name, got {value!r}")
+        raise InputError(f"{owner}: {name} must be one of unrender.losses or its name, got {in_words(value)}")
     return tables.component(value, "loss", f"{owner}: {name}")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.geometry import rotation
+from unrender.core.text import in_words
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.description import load, load_described
 from unrender.scene.meshes import subdivided
@@ -240,7 +241,7 @@ def _kind(path: str) -> str:
 
 def _check(owner: str, name: str, value: Any) -> str:
     if not isinstance(value, (str, Path)):
-        raise InputError(f"{owner}: {name} must be the path of a {' or '.join(_KINDS)} file, got {value!r}")
+        raise InputError(f"{owner}: {name} must be the path of a {' or '.join(_KINDS)} file, got {in_words(value)}")
     if value == "":
         return ""
     if Path(value).suffix.lower() not in _KINDS:

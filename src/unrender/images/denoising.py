@@ -20,7 +20,7 @@ from unrender.core.checks import Several
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, Plain, WithoutSnapshot
 from unrender.rendering.renderer import Space
@@ -46,7 +46,7 @@ def choose(by: Denoiser = "auto") -> Denoiser:
     """
     if by not in ("auto", *_DENOISERS):
         known = ("auto", *_DENOISERS)
-        raise InputError(f"denoiser {by!r}: expected {', '.join(known)}{did_you_mean(str(by), known)}")
+        raise InputError(f"denoiser {in_words(by)}: expected {', '.join(known)}{did_you_mean(by, known)}")
     if by == "auto":
         by = "oidn" if optix_problem() else "optix"
     elif by == "optix" and (problem := optix_problem()):
@@ -197,7 +197,7 @@ class Denoised(WithoutSnapshot):
     def __post_init__(self):
         checks.fields(self)
         if isinstance(self.inner, (type, Denoised)):
-            raise InputError(f"Denoised: inner must be an image estimator such as Plain(), got {self.inner!r}")
+            raise InputError(f"Denoised: inner must be an image estimator such as Plain(), got {in_words(self.inner)}")
 
     @property
     def space(self) -> Space | None:

@@ -27,6 +27,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, periodic
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.io import bounded_files, images, resampling, volumes
 
 MESH_FILES = (".obj", ".ply", ".serialized")
@@ -97,7 +98,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
             raise TypeError
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"expected a number, a colour, a picture or grid file or an array, got {_short(initial)}"
+            f"expected a number, a colour, a picture or grid file or an array, got {in_words(initial)}"
         ) from error
     refuse_encoded(array)
     with np.errstate(over="ignore"):
@@ -219,8 +220,3 @@ def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str
     accepted += ["a mesh file"] if conversion.vertices is not None else []
     comma = "," if len(accepted) > 1 or conversion.takes_number else ""
     return f"{', '.join(accepted)}{comma} or an array of shape {conversion.picture_shape(shape)}"
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

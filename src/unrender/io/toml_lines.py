@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.io import bounded_files
 
 if sys.version_info >= (3, 11):
@@ -259,7 +259,7 @@ def _explain(detail: Any, content: Any, model: type, tables: Mapping[str, type])
     for part in place:
         content = content[part]
     entry = location[len(place)] if len(location) > len(place) and isinstance(content, dict) else None
-    got = str(detail["input"]).lower() if isinstance(detail["input"], bool) else repr(detail["input"])
+    got = str(detail["input"]).lower() if isinstance(detail["input"], bool) else in_words(detail["input"])
     got = f"{entry} = {got}" if isinstance(content, dict) and entry in content else got
     return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
 

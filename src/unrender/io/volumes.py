@@ -17,7 +17,9 @@ from typing import IO, Any
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.io import bounded_files, files
 
 READABLE = (".vol", ".npy", ".npz")
@@ -103,12 +105,15 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
         stream = mi.MemoryStream()
         values.write(stream)
         return files.write(file, stream.raw_buffer())
-    array = np.ascontiguousarray(values, np.float32)
+    try:
+        array = np.ascontiguousarray(values, np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{file}: expected an array of numbers, got {in_words(values)}") from error
     array = array[..., None] if array.ndim == 3 else array
     if array.ndim != 4 or array.size == 0:
         raise InputError(f"{file}: expected a grid of shape (Z, Y, X, C), got {array.shape}")
-    if len(box) != 6 or not all(math.isfinite(side) for side in box):
-        raise InputError(f"{file}: box: expected six finite numbers, got {box!r}")
+    if len(box) != 6 or not all(math.isfinite(checks.real(side)) for side in box):
+        raise InputError(f"{file}: box: expected six finite numbers, got {in_words(box)}")
     _check_finite(file, array)
     buffer = io.BytesIO()
     if ending == ".vol":

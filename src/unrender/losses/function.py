@@ -15,7 +15,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
-from unrender.core.text import reason_of
+from unrender.core.text import in_words, reason_of
 
 Backend = Literal["drjit", "torch"]
 
@@ -42,7 +42,9 @@ class FunctionLoss:
 
     def __post_init__(self):
         if isinstance(self.function, type) or not callable(self.function):
-            raise InputError(f"expected one of unrender.losses, such as L2(), or a function, got {self.function!r:.80}")
+            raise InputError(
+                f"expected one of unrender.losses, such as L2(), or a function, got {in_words(self.function)}"
+            )
         self.takes_reference  # noqa: B018 (raises for arguments that cannot be filled in)
 
     @functools.cached_property

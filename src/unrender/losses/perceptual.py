@@ -20,7 +20,7 @@ from unrender.core.arrays import Array
 from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.core.text import did_you_mean, reason_of
+from unrender.core.text import did_you_mean, in_words, reason_of
 from unrender.io import bounded_files
 
 _SAFE_UNPICKLER = (2, 6)
@@ -66,14 +66,14 @@ class Perceptual:
     def __post_init__(self):
         checks.fields(self)
         if isinstance(self.layers, str) or not isinstance(self.layers, (list, tuple)) or not self.layers:
-            raise InputError(f"Perceptual: layers must be a list of names such as relu3_3, got {self.layers!r}")
+            raise InputError(f"Perceptual: layers must be a list of names such as relu3_3, got {in_words(self.layers)}")
         for name in self.layers:
-            if name not in LAYERS:
-                hint = did_you_mean(str(name), LAYERS) or f"; there are {', '.join(LAYERS)}"
-                raise InputError(f"Perceptual: layers: there is no {name!r}{hint}")
+            if not isinstance(name, str) or name not in LAYERS:
+                hint = did_you_mean(name, LAYERS) or f"; there are {', '.join(LAYERS)}"
+                raise InputError(f"Perceptual: layers: there is no {in_words(name)}{hint}")
         object.__setattr__(self, "layers", tuple(self.layers))
         if self.weights is not None and not isinstance(self.weights, (str, Path)):
-            raise InputError(f"Perceptual: weights must be a file, got {self.weights!r}")
+            raise InputError(f"Perceptual: weights must be a file, got {in_words(self.weights)}")
         self._network(np.dtype(np.float32))  # reports an invalid file at construction
 
     def value(self, image: Array, reference: Array) -> Array:

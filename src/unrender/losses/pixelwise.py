@@ -12,6 +12,7 @@ from unrender.core.arrays import Array
 from unrender.core.checks import Positive
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import in_words
 
 _CLEARLY = 4.0  # standard errors by which images are darker than a lower bound that they do not reach
 
@@ -117,7 +118,7 @@ class Censored:
     def __post_init__(self):
         checks.fields(self)
         if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
-            raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {self.loss!r:.80}")
+            raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {in_words(self.loss)}")
 
     def value(self, image: Array, reference: Array) -> Array:
         return self.loss.value(self._censored(image, reference), reference)

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 
 from unrender.core import registry
 from unrender.core.errors import InputError, UnknownOptionError
-from unrender.core.text import did_you_mean, grouped
+from unrender.core.text import did_you_mean, grouped, in_words
 
 if TYPE_CHECKING:
     from unrender.estimators.base import Estimator
@@ -86,11 +86,11 @@ class Method:
         except pydantic.ValidationError as error:
             detail = error.errors()[0]
             name = str(detail["loc"][0])
-            expected = f"expected {self.expected(name)}, got {detail['input']!r}"
+            expected = f"expected {self.expected(name)}, got {in_words(detail['input'])}"
             raise InputError(f"method {self.name}: option {name}: {expected}") from error
         for name, value in options:
             if isinstance(value, int) and value >= _TOO_LARGE:
-                expected = f"expected {self.expected(name)} and below 2**31, got {value}"
+                expected = f"expected {self.expected(name)} and below 2**31, got {in_words(value)}"
                 raise InputError(f"method {self.name}: option {name}: {expected}")
         return options
 
@@ -101,7 +101,7 @@ class Method:
     def expected(self, name: str) -> str:
         """Return a description of an option's values: "a whole number above 0"."""
         schema = self.options.model_json_schema()["properties"][name]
-        choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
+        choices = [_described(choice) for choice in schema.get("anyOf", [schema])]
         return " or ".join(choices)
 
     def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
@@ -175,7 +175,7 @@ def parse_schedule(text: str | None) -> Schedule | None:
     return None if text is None else tables.parse(text, "schedule")
 
 
-def _in_words(schema: Mapping[str, Any]) -> str:
+def _described(schema: Mapping[str, Any]) -> str:
     """Describe a part of a JSON schema in words."""
     if "enum" in schema:
         return " or ".join(schema["enum"])

@@ -12,7 +12,7 @@ import tomli_w
 
 from unrender.core import lazy
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 
 if TYPE_CHECKING:
     from unrender.core import tables
@@ -106,13 +106,13 @@ class Plan:
                 raise InputError(f"{where}: {name}: {type(made[name]).__name__} is not an {name}")
         entries = table.get("settings", {})
         if not isinstance(entries, Mapping):
-            raise InputError(f"{where}: settings: expected a table of settings by key, got {entries!r:.60}")
+            raise InputError(f"{where}: settings: expected a table of settings by key, got {in_words(entries)}")
         if other := next((key for key in entries if key not in problem.unknowns), None):
             raise InputError(f"{where}: settings: {other} is not an unknown{did_you_mean(other, problem.unknowns)}")
         settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in entries.items()}
         others = table.get("other_starts", [])
         if not isinstance(others, list) or not all(isinstance(key, str) and key in problem.unknowns for key in others):
-            raise InputError(f"{where}: other_starts: expected a list of unknowns, got {others!r:.60}")
+            raise InputError(f"{where}: other_starts: expected a list of unknowns, got {in_words(others)}")
         return cls(problem, made["estimator"], made["optimizer"], settings, other_starts=tuple(others))
 
 
@@ -171,7 +171,7 @@ def _settings_table(own: ParameterSettings) -> dict[str, Any]:
 def _settings(table: Any, where: str) -> ParameterSettings:
     """Return the settings of a table. Raises `InputError`."""
     if not isinstance(table, Mapping) or set(table) - set(vars(parameter.ParameterSettings())):
-        raise InputError(f"{where}: expected {', '.join(vars(parameter.ParameterSettings()))}, got {repr(table)[:60]}")
+        raise InputError(f"{where}: expected {', '.join(vars(parameter.ParameterSettings()))}, got {in_words(table)}")
     made: dict[str, Any] = dict(table)
     if "preconditioner" in made:
         made["preconditioner"] = tables.component(made["preconditioner"], "preconditioner", where=where)

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from unrender.core import checks
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.schedules import Schedule
@@ -84,7 +84,7 @@ def check_rates(owner: str, learning_rate: Any, schedule: Any) -> None:
     else:
         checks.number(owner, "learning_rate", learning_rate, above=0.0)
     if schedule is not None and not callable(schedule):
-        raise InputError(f"{owner}: schedule must be one of unrender.schedules or None, got {schedule!r}")
+        raise InputError(f"{owner}: schedule must be one of unrender.schedules or None, got {in_words(schedule)}")
 
 
 def rates_of(
@@ -109,5 +109,5 @@ def schedule_factor(owner: str, schedule: Schedule | None, step: int) -> float:
     """Return the schedule's factor at `step`. Raises `InputError` if it is negative or not finite."""
     value = 1.0 if schedule is None else float(schedule(step))
     if not (math.isfinite(value) and value >= 0.0):
-        raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {value!r} at step {step}")
+        raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {in_words(value)} at step {step}")
     return value

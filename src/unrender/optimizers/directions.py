@@ -13,6 +13,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import AtBounds, Smoothing
@@ -71,9 +72,9 @@ def check_options(owner: str, options: DirectionOptions) -> None:
     """Raise `InputError` for an option out of range or of the wrong type."""
     check_rates(owner, options.learning_rate, options.schedule)
     if checks.number(owner, "step_scale", options.step_scale, above=0.0) > 1.0:
-        raise InputError(f"{owner}: step_scale must be at most 1, got {options.step_scale!r}")
+        raise InputError(f"{owner}: step_scale must be at most 1, got {in_words(options.step_scale)}")
     if options.inner_optimizer is not None and not isinstance(options.inner_optimizer, Adam):
-        raise InputError(f"{owner}: inner_optimizer must be an Adam or None, got {options.inner_optimizer!r}")
+        raise InputError(f"{owner}: inner_optimizer must be an Adam or None, got {in_words(options.inner_optimizer)}")
 
 
 def init_state(

@@ -12,6 +12,7 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.checks import Count, Seed
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
 from unrender.losses import L2
@@ -54,7 +55,9 @@ class Options:
         owner = "Renderer"
         checks.fields(self, owner)
         if isinstance(self.image, type) or not callable(getattr(self.image, "estimate", None)):
-            raise InputError(f"{owner}: image must be one of unrender.images, such as Plain(), got {self.image!r}")
+            raise InputError(
+                f"{owner}: image must be one of unrender.images, such as Plain(), got {in_words(self.image)}"
+            )
         check_pixels(owner, self.pixels, self.image, self.spp)
         if isinstance(self.pixels, AdaptiveCounts):
             raise InputError(
@@ -103,7 +106,7 @@ def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPo
     """Return the renderer port of a scene, and the keys as a tuple. Raises `InputError` if either is invalid."""
     names = (keys,) if isinstance(keys, str) else keys
     if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
-        raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
+        raise InputError(f"Renderer: keys must be a list of scene parameters, got {in_words(keys)}")
     if max_depth is not None:
         checks.integer("Renderer", "max_depth", max_depth, at_least=1)
     keys = [name for name in names if isinstance(name, str)]
@@ -117,7 +120,7 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
     for sensor in sensors:
         if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
-            raise InputError(f"Renderer: sensor must be {have}, got {sensor!r}")
+            raise InputError(f"Renderer: sensor must be {have}, got {in_words(sensor)}")
 
     def channels(sensor: int) -> int:
         return 1 if format_of(renderer, sensor).colour == "luminance" else 3

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
+from unrender.core.text import in_words
 from unrender.core.trees import Tree, add, numpy
 from unrender.images.base import ImageEstimator, Plain
 from unrender.losses import Loss
@@ -104,11 +105,11 @@ class Renderer:
     ):
         port, names = open_scene(scene, keys, max_depth)
         single = not isinstance(sensor, Sequence)
-        sensors = (sensor,) if single else tuple(sensor)
+        sensors = tuple(checks.integer("Renderer", "sensor", one, 0) for one in ((sensor,) if single else sensor))
         targets = () if references is None else (references,) if single else tuple(references)
         if not sensors or len(set(sensors)) < len(sensors) or (targets and len(targets) != len(sensors)):
             raise InputError(
-                f"Renderer: expected different sensors, each with a reference if any has one, got {sensor!r}"
+                f"Renderer: expected different sensors, each with a reference if any has one, got {in_words(sensor)}"
             )
         options = (image or Plain(), pixels or All(), spp, adjoint_spp, groups, coupled, sensors, single)
         self._options = Options(names, *options, max_depth or longest_path(port), seed, targets, loss)
@@ -346,7 +347,8 @@ class Renderer:
             if sensor is not None:
                 raise InputError("Renderer: a mini-batch contains all sensors; pass them at construction, sensor=[...]")
             return [_MINI_BATCHES]
-        return [str(one) for one in (self._options.sensors if sensor is None else [sensor])]
+        sensors = self._options.sensors if sensor is None else [checks.integer("Renderer", "sensor", sensor, 0)]
+        return [str(one) for one in sensors]
 
     def _stream(self, name: str) -> Stream:
         if name not in self._streams:

@@ -20,6 +20,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 
 
 class Transform:
@@ -111,7 +112,7 @@ def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
     setting = tuple(wrap) if isinstance(wrap, list) else wrap  # TOML has lists, which are not hashable
     axes = setting if isinstance(setting, tuple) else (setting,)
     if not axes or not all(isinstance(wraps, bool) for wraps in axes):
-        raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {setting!r}")
+        raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {in_words(setting)}")
     return setting
 
 

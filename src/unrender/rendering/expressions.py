@@ -14,7 +14,7 @@ import numpy as np
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
-from unrender.core.text import did_you_mean, listed
+from unrender.core.text import did_you_mean, in_words, listed
 from unrender.core.trees import Tree
 from unrender.io import bounded_files, parameter_values
 from unrender.rendering.expression_texts import Function, parse
@@ -49,7 +49,7 @@ class Expression:
         if isinstance(expression, str):
             return cls(key, parse(key, expression), expression)
         if not callable(expression):
-            raise KeyedError(key, f"expected a function or a text such as '2 * strength', got {expression!r:.60}")
+            raise KeyedError(key, f"expected a function or a text such as '2 * strength', got {in_words(expression)}")
         return cls(key, expression)
 
 
@@ -250,7 +250,7 @@ def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
     like = values.like
     result = one.function(values)
     if result is None or isinstance(result, str):
-        raise KeyedError(one.key, f"the function returned {result!r:.30}, expected a Dr.Jit tensor")
+        raise KeyedError(one.key, f"the function returned {in_words(result)}, expected a Dr.Jit tensor")
     if not arrays.is_drjit(result) or not dr.is_tensor_v(result):
         result = type(like)(result)
     if tuple(result.shape) == shape:

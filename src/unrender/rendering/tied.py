@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import ParameterInfo, Renderer, RenderSession, ReplacedMesh, SampleRequest
@@ -41,7 +41,7 @@ class Tie:
             raise InputError("expected at least one key")
         for member, factor in self.factors.items():
             if not math.isfinite(checks.real(factor)) or factor == 0:
-                raise InputError(f"{member}: expected a finite factor other than 0, got {factor!r:.60}")
+                raise InputError(f"{member}: expected a finite factor other than 0, got {in_words(factor)}")
 
     def info(self, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
         """Return the description of the unknown. Raise `KeyedError` if the members are incompatible."""

@@ -14,6 +14,7 @@ from unrender.core import arrays, checks, periodic, timing
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
+from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
@@ -108,9 +109,9 @@ def check_arguments(owner: str, problem: Any, values: Any, seconds: Any, seed: A
     """Raise `InputError` unless these are a problem, finite values of its unknowns or None, a number of seconds, which may be infinite,
     and a seed."""
     if not isinstance(problem, Problem):
-        raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {problem!r:.60}")
+        raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {in_words(problem)}")
     if isinstance(seconds, bool) or not isinstance(seconds, Real) or np.isnan(float(seconds)):
-        raise InputError(f"{owner}: seconds must be a number, got {seconds!r:.60}")
+        raise InputError(f"{owner}: seconds must be a number, got {in_words(seconds)}")
     check_seed(f"{owner}: seed", seed)
     as_tree(problem, values)
 

@@ -15,7 +15,7 @@ from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.display.notebook import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods import method, methods
@@ -107,7 +107,7 @@ def _check_kinds(problem: Any, callbacks: Any) -> None:
     if not isinstance(problem, Problem):
         raise InputError(f"optimize: expected a Problem, such as that of Problem.from_file, got {_shown(problem)}")
     if not isinstance(callbacks, Sequence) or not all(isinstance(each, Callback) for each in callbacks):
-        raise InputError(f"optimize: callbacks: expected a list of Callback objects, got {callbacks!r:.80}")
+        raise InputError(f"optimize: callbacks: expected a list of Callback objects, got {in_words(callbacks)}")
 
 
 @contextmanager
@@ -278,4 +278,4 @@ def _instead_of_optimizer(value: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    return f"the class {value.__name__}" if isinstance(value, type) else repr(value)[:80]
+    return f"the class {value.__name__}" if isinstance(value, type) else in_words(value)

@@ -11,7 +11,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
-from unrender.core.text import listed, shorten
+from unrender.core.text import in_words, listed
 from unrender.core.trees import Tree
 from unrender.parameterisations import Bounds
 from unrender.rendering.renderer import ParameterInfo
@@ -208,13 +208,13 @@ def _read(bounds: Any) -> Bounds:
     bounds = checks.array_like(bounds, "give (low, high), either may be None")
     bounds = bounds.tolist() if hasattr(bounds, "tolist") else bounds
     if isinstance(bounds, (str, bytes)) or not isinstance(bounds, Sequence) or len(bounds) != 2:
-        raise InputError(f"expected (low, high), either may be None, got {shorten(repr(bounds), 60)}")
+        raise InputError(f"expected (low, high), either may be None, got {in_words(bounds)}")
     for side in bounds:
         if side is not None and math.isnan(checks.real(side)):
-            raise InputError(f"expected two numbers or None, got {shorten(repr(side), 60)}")
+            raise InputError(f"expected two numbers or None, got {in_words(side)}")
     low, high = (None if side is None else _single(checks.real(side)) for side in bounds)
     if low == math.inf or high == -math.inf:
-        given = " and ".join(shorten(str(side), 60) for side in bounds)
+        given = " and ".join(map(in_words, bounds))
         raise InputError(f"low must be less than high, with numbers up to {_LARGEST:.3g} between, got {given}")
     low, high = None if low == -math.inf else low, None if high == math.inf else high
     if low is not None and high is not None and low >= high:

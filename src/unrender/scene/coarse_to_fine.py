@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import checks, tables
 from unrender.core.checks import Several
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.io import resampling
 
 NEVER = 1 << 40
@@ -49,7 +50,7 @@ class CoarseToFine:
         wrap = tuple(self.wrap) if isinstance(self.wrap, (list, tuple)) else self.wrap
         object.__setattr__(self, "wrap", wrap)
         if not all(isinstance(wraps, bool) for wraps in (wrap if isinstance(wrap, tuple) else (wrap,))):
-            raise InputError(f"CoarseToFine: wrap must be true, false, or one of these per axis, got {wrap!r}")
+            raise InputError(f"CoarseToFine: wrap must be true, false, or one of these per axis, got {in_words(wrap)}")
 
     def check(self, shape: tuple[int, ...]) -> None:
         """Raise `InputError` for a parameter of this (full) shape that cannot have coarser resolutions."""
@@ -84,7 +85,7 @@ def checked_steps(owner: str, values: Any) -> tuple[int, ...]:
     steps = tuple(values) if isinstance(values, (list, tuple)) else ()
     if not steps or not all(type(step) is int and step >= 1 for step in steps) or list(steps) != sorted(set(steps)):
         what = "whole numbers of at least 1 that ascend, such as [200, 400]"
-        raise InputError(f"{owner}: steps must be {what}, got {values!r:.80}")
+        raise InputError(f"{owner}: steps must be {what}, got {in_words(values)}")
     return steps
 
 

@@ -12,7 +12,7 @@ from unrender.core import checks, tables
 from unrender.core.checks import NotNegative, Positive
 from unrender.core.errors import InputError
 from unrender.core.geometry import weld
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.io.toml_lines import FieldError
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.renderer import ReplacedMesh
@@ -183,7 +183,7 @@ def remeshing_of(value: Any) -> Remeshing:
         return value
     if not isinstance(value, (Mapping, Sequence)) or isinstance(value, str):
         raise InputError(
-            f"expected steps such as [100, 200], or a table such as {{ steps = [100] }}, got {value!r:.60}"
+            f"expected steps such as [100, 200], or a table such as {{ steps = [100] }}, got {in_words(value)}"
         )
     return tables.build(Remeshing, dict(value) if isinstance(value, Mapping) else {"steps": value})
 
@@ -265,7 +265,7 @@ def check_remeshing(value: Any, mesh: _Arrays | None, uv: Callable[[], np.ndarra
 def check_self_intersection(choice: Any, mesh: _Arrays | None) -> None:
     """Raise `InputError` for an invalid treatment of self-intersections; see `Parameter`."""
     if choice not in _SELF_INTERSECTIONS:
-        raise InputError(f'expected "warn", "prevent" or "ignore", got {choice!r}')
+        raise InputError(f'expected "warn", "prevent" or "ignore", got {in_words(choice)}')
     if choice != "warn" and mesh is None:
         raise InputError(_NO_MESH)
 

@@ -14,6 +14,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
+from unrender.core.text import in_words
 from unrender.io.toml_lines import FieldError
 from unrender.parameterisations import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
@@ -100,7 +101,7 @@ class ParameterSettings:
         if self.start is None:
             return
         if not isinstance(self.start, (list, tuple)):
-            raise InputError(f"settings: start must be a list of numbers, got {self.start!r:.60}")
+            raise InputError(f"settings: start must be a list of numbers, got {in_words(self.start)}")
         values = tuple(_single("start", checks.number("settings", "start", value)) for value in self.start)
         object.__setattr__(self, "start", values)
 
@@ -119,8 +120,9 @@ def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:
         keys, place = parameter.keys, ("parameters", index, "keys")
         if keys is None:
             continue
-        if isinstance(keys, str) or not isinstance(keys, (Sequence, Mapping)):
-            raise FieldError(place, f"expected a list of keys, or a table of factors by key, got {keys!r}")
+        listed = isinstance(keys, (Sequence, Mapping)) and not isinstance(keys, str)
+        if not listed or not all(isinstance(key, str) for key in keys):
+            raise FieldError(place, f"expected a list of keys, or a table of factors by key, got {in_words(keys)}")
         factors = dict(keys) if isinstance(keys, Mapping) else dict.fromkeys(keys, 1.0)
         if other := next((key for key in factors if key in names and key != parameter.key), None):
             raise FieldError(place, f"{other} is an unknown of its own; remove it here or there")

@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, periodic, tables
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.io import resampling
 from unrender.preconditioners import grid
 from unrender.preconditioners.mesh import MeshTopology
@@ -76,7 +77,7 @@ class Prior:
             raise InputError("prior: expected near, palette, smoothness or total_variation")
         if isinstance(self.near, (str, bool)) and self.near != "initial":
             raise InputError(
-                f'prior: near must be a number, one number per channel, or "initial", got {self.near!r:.60}'
+                f'prior: near must be a number, one number per channel, or "initial", got {in_words(self.near)}'
             )
 
     def on(
@@ -111,7 +112,7 @@ class Prior:
         for name, given, values in (("near", self.near, near), ("palette", self.palette, palette)):
             if values is not None and not arrays.all_within(values, low, high):
                 within = " and ".join(checks.limits(*bounds))
-                raise InputError(f"prior: {name}: expected {within} as the unknown's bounds, got {given!r:.60}")
+                raise InputError(f"prior: {name}: expected {within} as the unknown's bounds, got {in_words(given)}")
         if self.smoothness is not None or self.total_variation is not None:
             if moving:
                 raise InputError("prior: neighbouring positions differ; a mesh has regularizer = { bilaplacian = ... }")
@@ -284,7 +285,7 @@ def _frozen(value: Any) -> Any:
 def _numbers(name: str, value: Any) -> np.ndarray:
     try:
         values = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = np.full(1, np.nan)
     if not np.isfinite(values).all():
         raise InputError(f"prior: {name} must have finite numbers, and rows of one length")

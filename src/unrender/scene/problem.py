@@ -14,6 +14,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.exclusive import exclusive
+from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.io.toml_lines import FieldError
 from unrender.losses import L2, Loss
@@ -127,6 +128,7 @@ class Problem(ViewLosses):
         check_max_depth(max_depth)
         checks.optional("name", name, str, "text")
         checks.optional("truth", truth, Mapping, "values by key of the parameters")
+        checks.optional("surfaces", surfaces, Mapping, "surfaces by key of the parameters")
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
@@ -379,7 +381,9 @@ def open_scene(
     """Return the renderer of a scene in which the ties of these parameters are unknowns, and `others` will be used. Raises `FieldError`."""
     functions = {} if expressions is None else expressions
     if not (isinstance(functions, Mapping) and all(isinstance(key, str) for key in functions)):
-        raise FieldError(("expressions",), f"expected texts or functions by key of the scene, got {functions!r:.60}")
+        raise FieldError(
+            ("expressions",), f"expected texts or functions by key of the scene, got {in_words(functions)}"
+        )
     if taken := next((key for key in scene_keys(parameters) if key in functions), None):
         index = next(n for n, one in enumerate(parameters) if taken == one.key or taken in (one.keys or ()))
         field = "key" if parameters[index].keys is None else "keys"

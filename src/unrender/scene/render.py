@@ -10,6 +10,7 @@ from unrender.core import arrays, checks, timing
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
+from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.io import parameter_values
 from unrender.rendering.renderer import SampleRequest
@@ -49,12 +50,13 @@ def render(
     spp = checks.integer("render", "spp", spp, at_least=1)
     seed, view = check_seed("render: seed", seed), checks.integer("render", "view", view, at_least=0)
     if view >= len(problem.views):
-        raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
+        raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {in_words(view)}")
     point = as_tree(problem, parameters)
     session = problem.renderer.prepare(list(point), None, derivatives=False)
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
-    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width), per_pass or spp))
+    most = spp if per_pass is None else checks.integer("render", "per_pass", per_pass, at_least=1)
+    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width), most))
     # Views of one seed are independent, so their noise averages out.
     total, done, key = np.zeros((height, width, 3)), 0, Key(seed, view)
     while done < spp:
@@ -119,7 +121,7 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
     if parameters is None:
         return point
     if not isinstance(parameters, Mapping):
-        raise InputError(f"parameters: expected values by key of the problem's unknowns, got {parameters!r:.60}")
+        raise InputError(f"parameters: expected values by key of the problem's unknowns, got {in_words(parameters)}")
     if set(parameters) != set(point):
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
     given = {key: checks.array_like(value, "fill it") for key, value in parameters.items()}

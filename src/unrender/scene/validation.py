@@ -15,7 +15,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, tables
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, listed, shorten
+from unrender.core.text import did_you_mean, in_words, listed, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.io.toml_lines import FieldError
 from unrender.losses import FunctionLoss, Loss
@@ -62,7 +62,7 @@ def check_max_depth(max_depth: Any) -> None:
         return
     if isinstance(max_depth, bool) or not isinstance(max_depth, (int, np.integer)) or max_depth < 1:
         hint = "; for Mitsuba's -1 (no limit) use a large number such as 64" if max_depth == -1 else ""
-        shown = shorten(repr(max_depth), 60)
+        shown = in_words(max_depth)
         raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {shown}{hint}")
     if max_depth > _DEEPEST:
         raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(int(max_depth)), 60)}")
@@ -105,7 +105,7 @@ def check_parameter(
     with checking("learning_rate"):
         rate = parameter.learning_rate
         if rate is not None and (not is_number(rate) or rate <= 0):
-            raise InputError(f"expected a number above 0, got {rate!r}")
+            raise InputError(f"expected a number above 0, got {in_words(rate)}")
     parameterisation, transform = None, None
     with checking("preconditioner"):
         preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
@@ -175,7 +175,8 @@ def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
     """Return the renderer's description of a parameter. Raises `FieldError` for a key that is unknown or cannot be recovered."""
     if not isinstance(key, str) or key not in known:
-        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
+        name = key if isinstance(key, str) else in_words(key)
+        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {name}{near_key(name, known)}")
     if len(key) > _LONGEST_KEY:  # it becomes part of file names
         raise FieldError(
             ("parameters", index, "key"), f"{key}: expected at most {_LONGEST_KEY} characters, got {len(key)}"
@@ -207,9 +208,7 @@ def _check_parameterisation(
         else parameterisation
     )
     if isinstance(made, type) or not isinstance(made, Parameterisation):
-        raise InputError(
-            f"expected one of unrender.parameterisations, or its name, got {shorten(repr(parameterisation), 60)}"
-        )
+        raise InputError(f"expected one of unrender.parameterisations, or its name, got {in_words(parameterisation)}")
     return made, made.transform(bounds, initial)
 
 
@@ -249,7 +248,7 @@ def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) ->
     if preconditioner is None:
         return None
     if isinstance(preconditioner, type) or not isinstance(preconditioner, Preconditioner):
-        raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
+        raise InputError(f"expected one of unrender.preconditioners, got {in_words(preconditioner)}")
     preconditioner = bound_to(preconditioner, mesh_topology(info), info.conversion.repeated)
     try:
         preconditioner.check(key, info.shape)

@@ -27,6 +27,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.io import images, parameter_values
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.io.toml_lines import FieldError
@@ -198,7 +199,9 @@ def check_sensor(index: int, view: View, count: int) -> None:
     """Raise `FieldError` unless the `index`-th view has one of `count` sensors."""
     if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < count:
         have = f"0 to {count - 1}" if count > 1 else "0, the only sensor"
-        raise FieldError(("views", index, "sensor"), f"expected {have}, got {view.sensor!r}", f"view {index}: sensor")
+        raise FieldError(
+            ("views", index, "sensor"), f"expected {have}, got {in_words(view.sensor)}", f"view {index}: sensor"
+        )
 
 
 def _check_view(
@@ -212,7 +215,7 @@ def _check_view(
         return FieldError(("views", index, field), str(what), f"{owner}: {field}")
 
     if not is_number(view.weight) or view.weight <= 0:
-        raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
+        raise wrong("weight", f"expected a number above 0, got {in_words(view.weight)}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
     limited, alpha, loses_alpha = None, None, False  # the reference, if it is clipped at white; its alpha

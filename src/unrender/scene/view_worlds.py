@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, listed
+from unrender.core.text import did_you_mean, in_words, listed
 from unrender.io import parameter_values
 from unrender.io.toml_lines import FieldError
 from unrender.rendering import AOVS
@@ -41,7 +41,7 @@ def of_views(
     """
     for index, view in enumerate(views):
         if isinstance(view.known, Mapping) and not all(isinstance(key, str) for key in view.known):
-            what = f"expected values by key of the scene, got {view.known!r:.60}"
+            what = f"expected values by key of the scene, got {in_words(view.known)}"
             raise FieldError(("views", index, "with"), what, f"view {index}: known")
     renderer, sensors = _turned(renderer, views, keys)
     if sensors:
@@ -180,7 +180,7 @@ def _opened(
 def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
     place, owner = ("views", index, "aov"), f"view {index}: aov"
     if name not in AOVS:
-        raise FieldError(place, f"expected one of {', '.join(AOVS)}, got {name!r:.60}", owner)
+        raise FieldError(place, f"expected one of {', '.join(AOVS)}, got {in_words(name)}", owner)
     if isinstance(own, AovRenderer):
         with FieldError.at(place, owner):
             return own.with_aov(name)
@@ -192,7 +192,7 @@ def _values(
 ) -> dict[str, np.ndarray]:
     place, owner = ("views", index, "with"), f"view {index}: known"
     if not isinstance(known_values, Mapping):
-        raise FieldError(place, f"expected a table of values by key, got {known_values!r:.60}", owner)
+        raise FieldError(place, f"expected a table of values by key, got {in_words(known_values)}", owner)
     values = {}
     for key, value in known_values.items():
         if key not in known:
@@ -209,7 +209,7 @@ def _values(
         if not arrays.all_within(filled, info.lowest, info.highest):
             raise FieldError(
                 place,
-                f"{key}: expected {' and '.join(checks.limits(info.lowest, info.highest))}, got {value!r:.60}",
+                f"{key}: expected {' and '.join(checks.limits(info.lowest, info.highest))}, got {in_words(value)}",
                 owner,
             )
         values[key] = np.asarray(filled, np.float32)

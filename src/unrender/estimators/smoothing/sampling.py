@@ -12,6 +12,7 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.checks import DropReport
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class SmoothedFunction:
         self.n = self.theta.size
         self.sigma = self.vector("sigma", sigma)
         if not (self.sigma > 0).all():
-            raise InputError(f"{self.owner}: sigma must be above 0, got {sigma!r}")
+            raise InputError(f"{self.owner}: sigma must be above 0, got {in_words(sigma)}")
         self.antithetic, self.low_discrepancy = options.antithetic, options.low_discrepancy
         self.orthogonal = options.orthogonal
         if self.orthogonal and (self.low_discrepancy or options.product or not options.aggregate):
@@ -73,7 +74,9 @@ class SmoothedFunction:
         """Return a finite vector (n,) from a number or a vector."""
         array = np.array(value, np.float64)
         if array.shape not in ((), (self.n,)) or not np.isfinite(array).all():
-            raise InputError(f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {value!r}")
+            raise InputError(
+                f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {in_words(value)}"
+            )
         return np.broadcast_to(array, (self.n,)).copy()
 
     def direction(self, v: Any) -> tuple[np.ndarray, float]:

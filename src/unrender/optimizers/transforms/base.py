@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capability
@@ -159,16 +160,16 @@ def checked_keys(owner: str, keys: Any) -> tuple[str, ...]:
     """Return keys of parameters as a tuple. Raise `InputError` for anything else."""
     names: tuple[Any, ...] = tuple(keys) if isinstance(keys, Iterable) and not isinstance(keys, str) else (None,)
     if not all(isinstance(name, str) for name in names):
-        raise InputError(f"{owner} must be keys of parameters, got {keys!r}")
+        raise InputError(f"{owner} must be keys of parameters, got {in_words(keys)}")
     return names
 
 
 def checked_transforms(owner: str, parts: Any) -> tuple[StepTransform, ...]:
     """Return transforms as a tuple. Raise `InputError` for anything else, or if one before the last sets the steps."""
     if not isinstance(parts, (list, tuple)):
-        raise InputError(f"{owner}: expected a list of transforms such as ScaleByRms(), got {parts!r:.80}")
+        raise InputError(f"{owner}: expected a list of transforms such as ScaleByRms(), got {in_words(parts)}")
     if wrong := [part for part in parts if not isinstance(part, StepTransform)]:
-        raise InputError(f"{owner}: expected transforms such as ScaleByRms(), got {wrong[0]!r:.80}")
+        raise InputError(f"{owner}: expected transforms such as ScaleByRms(), got {in_words(wrong[0])}")
     if early := [type(part).__name__ for part in parts[:-1] if part.sets_steps]:
         raise InputError(f"{owner}: {early[0]} sets the steps, so later transforms have no effect; put it last")
     return tuple(parts)
