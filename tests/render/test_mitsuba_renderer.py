@@ -14,6 +14,7 @@ import unrender as ur
 from kernels import recorded
 from tiers import quick
 from unrender.rendering.mitsuba import mesh_layout
+from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import from_tensor, to_tensor
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -95,6 +96,26 @@ def test_a_ready_made_object_cannot_be_in_two_states() -> None:
         return box(cube={"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}})
 
     assert ur.optimize(problem(scene, key), estimator, ur.optimizers.Adam(), steps=2).steps == 2
+
+
+def test_states_of_a_batch_set_the_values_that_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some BSDFs compute tables when they are set, which took most of the time of Gauss-Newton steps by a `roughplastic`."""
+    renderer, keys, request = MitsubaRenderer(box()), [WALL, "light.emitter.radiance.value"], SampleRequest(0, 2, 1)
+    wall, light = (renderer.values(keys)[key].numpy() for key in keys)
+    states = {keys[0]: np.stack([wall] * 4), keys[1]: np.stack([light, light, 2 * light, light])}
+    update, updated = LoadedScene._update, []
+
+    def noted(self: LoadedScene, changed: list[str]) -> None:
+        updated.append([*changed])
+        update(self, changed)
+
+    monkeypatch.setattr(LoadedScene, "_update", noted)
+    images = renderer.prepare(keys, None, derivatives=False).image_batch(states, request).numpy()
+    assert updated == [keys, keys[1:], keys[1:]]
+    brighter = {keys[0]: states[keys[0]][2:3], keys[1]: states[keys[1]][2:3]}
+    alone = renderer.prepare(keys, None, derivatives=False).image_batch(brighter, request).numpy()
+    np.testing.assert_array_equal(images, [images[0], images[0], alone[0], images[0]])
+    assert (alone[0] > 1.5 * images[0]).any()
 
 
 CV = ur.images.RecursiveControlVariate

@@ -296,6 +296,21 @@ def tensor(values: np.ndarray) -> mi.TensorXf:
     return mi.TensorXf(arrays.owned(values, mi.Float), np.shape(values))
 
 
+class LatestTensors:
+    """Tensors of parameters in successive states. Equal values have the tensor of the state before, so that the scene is not updated: for
+    some BSDFs and for meshes that takes longer than a small picture."""
+
+    def __init__(self) -> None:
+        self._latest: dict[str, tuple[np.ndarray, mi.TensorXf]] = {}
+
+    def of(self, key: str, value: np.ndarray) -> mi.TensorXf:
+        """Return the tensor of a parameter's value."""
+        latest = self._latest.get(key)
+        if latest is None or not np.array_equal(latest[0], value):
+            latest = self._latest[key] = np.array(value), tensor(value)
+        return latest[1]
+
+
 def native_shape(value: Any) -> tuple[int, ...]:
     """Return the shape of the tensor for a Mitsuba value. Raise `TypeError` for a value that is not an array."""
     if isinstance(value, (int, float)):

@@ -33,7 +33,7 @@ from unrender.rendering.mitsuba.integrators.path import PathPair, PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses
-from unrender.rendering.mitsuba.parameters import is_broadcast, tensor
+from unrender.rendering.mitsuba.parameters import LatestTensors, is_broadcast, tensor
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
@@ -125,7 +125,7 @@ class MitsubaSession:
             scene.set_parameters({})  # restore shapes that an earlier session has moved
             self._posed = PosedScene(pair.current, fixed, self._attributed)
             share_addresses(self._posed.scenes())
-        self._at: dict[bool, mi.Float] = {}
+        self._at, self._state_tensors = dict[bool, mi.Float](), LatestTensors()
         self._light, self._sampler = paths, sampler
         self._traits = [trait for key, trait in traits.items() if key in derivatives]
         # A recording does not capture the parameters of a phase function, and its replay gives no gradient by them.
@@ -201,7 +201,7 @@ class MitsubaSession:
     def _batch(self, parameters: Tree, request: SampleRequest) -> mi.Float:
         """Return the concatenated pixels of states that share everything except their poses."""
         count = len(next(iter(parameters.values())))
-        at = {key: tensor(values[0]) for key, values in parameters.items()}
+        at = {key: self._state_tensors.of(key, values[0]) for key, values in parameters.items()}
         if self._posed is None or self._attached:
             self.set_parameters(at)
             radiance = self.kernel(ImagePass(), request)()
