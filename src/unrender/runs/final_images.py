@@ -36,10 +36,10 @@ from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_key
 from unrender.runs.map_fit import no_better_maps
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.numbers import TOO_SHORT
-from unrender.runs.reference_distortions import AS_IF, misplaced, unequal_brightness
+from unrender.runs.reference_distortions import AS_IF, of_references
 from unrender.runs.result import Result
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS
-from unrender.runs.verification import DIFFERS, SMOOTH, STEPS, Misfit, misfit_of_views
+from unrender.runs.verification import DIFFERS, SMOOTH, Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -167,10 +167,7 @@ def render_final_images(
     if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
         differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
     few = result.steps < (FEW_NEWTON_STEPS if complete else FEW_STEPS)  # lights may still be far from their values
-    words = "" if few else misplaced(problem, chosen, halves_of["initial"], ends)
-    sure = [x for x in (differs, result.misfit) if x and STEPS not in x.causes and AS_IF not in x.line]
-    if sure and not words and not few:
-        words = unequal_brightness(problem, chosen, ends)
+    words = "" if few else of_references(problem, chosen, halves_of["initial"], ends, (differs, result.misfit))
     texts, differs = _named([*lines, *maps.limited], differs, words)
     return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 

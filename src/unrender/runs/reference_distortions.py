@@ -10,11 +10,13 @@ import numpy as np
 
 from unrender.core.text import listed
 from unrender.display import formatting
+from unrender.runs.verification import STEPS
 from unrender.statistics import scores
 from unrender.statistics.paired_losses import slices_of_images
 
 if TYPE_CHECKING:
     from unrender.runs.numbers import Numbers
+    from unrender.runs.verification import Misfit
     from unrender.scene.problem import Problem
 
 AS_IF = "as if the reference of view"
@@ -129,6 +131,19 @@ def distortions_of_fit(
                 words = f"{AS_IF} {view} {describe(amounts)}" if named else "by what the unknowns do not explain"
                 found.append((explained, words, gains @ amounts))
     return [(words, moves) for _, words, moves in sorted(found, key=lambda each: -each[0])]
+
+
+def of_references(
+    problem: Problem,
+    views: Sequence[int],
+    starts: Sequence[Sequence[np.ndarray]],
+    ends: Sequence[Sequence[np.ndarray]],
+    differences: Sequence[Misfit | None],
+) -> str:
+    """Return what the references look like, see `misplaced` and, unless more steps may explain the known differences of the pictures from
+    them or they are already explained, `unequal_brightness`; "" for nothing."""
+    sure = any(of and STEPS not in of.causes and AS_IF not in of.line for of in differences)
+    return misplaced(problem, views, starts, ends) or (unequal_brightness(problem, views, ends) if sure else "")
 
 
 def misplaced(
