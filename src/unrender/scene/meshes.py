@@ -285,6 +285,7 @@ def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str
 
 def check_surfaces(surfaces: Mapping[str, Surface], faces: Mapping[str, np.ndarray]) -> None:
     """Raise `FieldError` for a true surface of a parameter that is not the vertex positions of a mesh."""
+    checks.optional("surfaces", surfaces, Mapping, "surfaces by key of the parameters")
     for key, surface in surfaces.items():
         if not isinstance(surface, Surface):
             what = f"expected an unrender.scene.surfaces.Surface, got {type(surface).__name__}"

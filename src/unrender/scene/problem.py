@@ -128,7 +128,6 @@ class Problem(ViewLosses):
         check_max_depth(max_depth)
         checks.optional("name", name, str, "text")
         checks.optional("truth", truth, Mapping, "values by key of the parameters")
-        checks.optional("surfaces", surfaces, Mapping, "surfaces by key of the parameters")
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
@@ -344,9 +343,8 @@ def _opened(
     sensors = [view.sensor for view in located]
     for index, view in enumerate(views):
         if view.aov is not None and (conflict := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
-            raise FieldError(
-                ("views", index, "aov"), f"not supported together with the unknown {conflict}; leave out one of them"
-            )
+            what = f"not supported together with the unknown {conflict}; leave out one of them"
+            raise FieldError(("views", index, "aov"), what)
     try:
         return with_photographs(renderer, keys, sensors), located
     except InputError as error:
@@ -381,15 +379,13 @@ def open_scene(
     """Return the renderer of a scene in which the ties of these parameters are unknowns, and `others` will be used. Raises `FieldError`."""
     functions = {} if expressions is None else expressions
     if not (isinstance(functions, Mapping) and all(isinstance(key, str) for key in functions)):
-        raise FieldError(
-            ("expressions",), f"expected texts or functions by key of the scene, got {in_words(functions)}"
-        )
+        what = f"expected texts or functions by key of the scene, got {in_words(functions)}"
+        raise FieldError(("expressions",), what)
     if taken := next((key for key in scene_keys(parameters) if key in functions), None):
         index = next(n for n, one in enumerate(parameters) if taken == one.key or taken in (one.keys or ()))
         field = "key" if parameters[index].keys is None else "keys"
-        raise FieldError(
-            ("parameters", index, field), f"{taken} has an expression, which sets it; leave out one of them"
-        )
+        what = f"{taken} has an expression, which sets it; leave out one of them"
+        raise FieldError(("parameters", index, field), what)
     renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])
     try:
         own = [p for p in parameters if isinstance(p.key, str) and p.keys is None and p.key not in OF_PHOTOGRAPHS]
