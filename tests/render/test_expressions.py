@@ -338,6 +338,8 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
         ({"expression": "strength +"}, r"it is no expression"),
         ({"expression": "-strength"}, r"intensity.value: expected at least 0, got -1 to -1 at the initial"),
         ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),
+        ({"expression": "strength * 1" + "0" * 400}, r"it is not finite at the initial values"),
+        ({"expression": "strength * [1" + "0" * 400 + "]"}, r"a list must have numbers"),
         ({"expression": "sqrt(strength - 1)"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.5"}, r"its derivative by strength is not finite at the initial values"),
         ({"expression": "(strength - 1) ** 0.3"}, r"its derivative by strength is not finite at the initial values"),

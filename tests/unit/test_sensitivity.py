@@ -101,6 +101,7 @@ def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):
                 ({"values": "out"}, "parameters: expected values by key of the problem's unknowns, got 'out'"),
                 ({"values": {"wall": np.zeros((2, 2, 2))}}, "parameter wall: expected shape"),
                 ({"seconds": "long"}, "seconds must be a number, got 'long'"),
+                ({"seconds": 10**400, "seed": "first"}, "seed: expected a whole number"),
                 ({"seed": "first"}, "seed: expected a whole number"),
             )
         ),

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.errors import KeyedError
 from unrender.core.text import did_you_mean
 
@@ -85,14 +85,14 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
 
     match node:
         case ast.Constant(value=value) if isinstance(value, (int, float)) and not isinstance(value, bool):
-            number = float(value)
+            number = checks.real(value)
             return lambda _: number
         case ast.Name(id=name):
             return lambda values: values[name]
         case ast.List():
             try:
                 table = np.array(ast.literal_eval(node), np.float32)
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, OverflowError) as error:
                 raise KeyedError(key, "a list must have numbers, in rows of one length") from error
             return lambda values: arrays.like(table, values.like)
         case ast.UnaryOp(op=ast.USub(), operand=operand):

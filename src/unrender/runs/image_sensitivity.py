@@ -110,7 +110,7 @@ def check_arguments(owner: str, problem: Any, values: Any, seconds: Any, seed: A
     and a seed."""
     if not isinstance(problem, Problem):
         raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {in_words(problem)}")
-    if isinstance(seconds, bool) or not isinstance(seconds, Real) or np.isnan(float(seconds)):
+    if isinstance(seconds, bool) or not isinstance(seconds, Real) or np.isnan(checks.real(seconds)):
         raise InputError(f"{owner}: seconds must be a number, got {in_words(seconds)}")
     check_seed(f"{owner}: seed", seed)
     as_tree(problem, values)
