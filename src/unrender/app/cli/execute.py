@@ -131,7 +131,8 @@ def _map_line(error: np.ndarray, share: np.ndarray) -> str:
     if not decided.any():
         return "decided by the start, by smoothing or by a prior, not by the references"
     median = formatting.number(float(np.median(error[decided])))
-    return f"{median} (median standard error where the references decided the values, {decided.mean():.0%} of all)"
+    where = f"where the references decided the values, {decided.mean():.0%} of all"
+    return f"{median} (median standard error, right to a factor of 1.7, {where})"
 
 
 def verified(result: Result) -> str:
