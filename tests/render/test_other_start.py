@@ -18,6 +18,7 @@ from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules.turns import better_turn, turns
+from unrender.runs import refinement
 
 pytestmark = pytest.mark.mitsuba
 
@@ -173,3 +174,14 @@ def test_turns_are_compositions_of_rotations() -> None:
         np.testing.assert_allclose(Rotation.from_rotvec(turn).as_matrix(), expected, atol=1e-6)
     angles = np.array(turns(np.array(0.5)))
     np.testing.assert_allclose(np.exp(1j * (angles - 0.5)), np.exp(0.25j * np.pi * np.arange(1, 8)), atol=1e-6)
+
+
+def test_translations_beside_rotations_are_not_turned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They were taken for angles, beyond their bounds, where a block of poses and all other unknowns were few numbers."""
+    few = [ur.Parameter("block.translation.x", bounds=(-0.2, 0.2)), ur.Parameter("lamp.intensity.value")]
+    made = ur.Problem(room(), [ur.Parameter(TURN, initial=1.9), *few], turned(1.9).views, max_depth=3)
+    plan, compared = method("auto").plan(made), []
+    assert plan.other_starts == (TURN, "block.translation.x")
+    monkeypatch.setattr(refinement, "better_turn", lambda problem, pictures, values, keys: compared.append(keys))
+    ur.optimize(made, plan, steps=17)
+    assert compared == [(TURN,)]

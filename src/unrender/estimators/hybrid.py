@@ -55,7 +55,7 @@ class HybridState:
     Attributes:
         perturbed: state of the second estimator.
         mean, square: running means of the perturbed parameters' gradient, and of its square, not debiased; {} unless `averaged`.
-        step: number of estimates since these began.
+        step: number of estimates since these began; with a block, of all.
         response: response of the eliminated textures; None without any.
     """
 

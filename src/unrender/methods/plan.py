@@ -41,7 +41,7 @@ class Plan:
         optimizer: Optimizer.
         settings: {key: settings of a parameter whose own are None}.
         reasons: Choices and their reasons, one line each.
-        other_starts: Keys of unknowns of which other values are compared during a run whose picture differs, see `runs.refinement`.
+        other_starts: Keys of unknowns of which other values are compared once during a run, see `runs.refinement`.
         cheaper: Function from a share of the time of a step to another plan with about that, and the options that differ; None without one.
     """
 

@@ -1,4 +1,4 @@
-"""Refinement during a run: of resolutions (coarse to fine), and of meshes (remeshing); and other starts of few numbers.
+"""Refinement during a run: of resolutions (coarse to fine), and of meshes (remeshing); and other starts.
 
 By default (`CoarseToFine.states`) the estimator's state is interpolated (`scene.upsampling`), and the optimizer's is not: a control
 variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
@@ -7,7 +7,7 @@ variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.methods.rules.starts import Place, better_place, number_of_places
-from unrender.methods.rules.turns import better_turn, number_of_turns
+from unrender.methods.rules.turns import better_turn, number_of_turns, turned_keys
 from unrender.optimizers.partitioned import Partitioned
 from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Remeshable, ReplacedMesh
@@ -215,21 +215,21 @@ class OtherStart(Callback):
     differ by more than noise, pictures of other values of `Plan.other_starts` are rendered. The run begins again at the best ones only if
     their loss is at most half of that of the descent so far, beyond noise. A descent that arrives is therefore not disturbed.
 
-    Of shapes beside textures (`Partitioned`), other turns are compared at the same instant, and any smaller loss is enough, beyond noise.
-    The block of the poses begins again there; textures and lights go on.
+    If a block of the unknowns (`Partitioned`) has rotations of shapes, other turns are compared instead, and any smaller loss is enough,
+    beyond noise. The block begins again there; the other unknowns go on.
     """
 
     def before_step(self, run: Run) -> None:
         state, keys = run.state, run.plan.other_starts
         if not keys or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
             return
-        block = isinstance(run.optimizer, Partitioned)
-        places = (number_of_turns if block else number_of_places)(run.problem, keys)
+        rotations = turned_keys(run.problem, keys) if isinstance(run.optimizer, Partitioned) else ()
+        places = number_of_turns(run.problem, rotations) if rotations else number_of_places(run.problem, keys)
         paths = max(_SHARE / places * state.samples, _LEAST_PATHS)
         pictures = FreshPictures(run.problem, run.seed, paths, _NUMBER)
         if run.problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
-        state.other_start = (_turned if block else _moved)(run, pictures) or _KEPT
+        state.other_start = (_turned(run, pictures, rotations) if rotations else _moved(run, pictures)) or _KEPT
 
     def on_result(self, run: Run, result: Result) -> Result:
         line = run.state.other_start
@@ -250,10 +250,10 @@ def _moved(run: Run, pictures: FreshPictures) -> str:
     return f"{BEGUN_AGAIN} {run.step} with other values of {listed(list(keys))}, {_loss(place)}"
 
 
-def _turned(run: Run, pictures: FreshPictures) -> str:
+def _turned(run: Run, pictures: FreshPictures, rotations: Sequence[str]) -> str:
     """Let the block of poses begin again where shapes are turned, if that picture is better. Returns a line about it, or ""."""
     problem, state, optimizer = run.problem, run.state, run.optimizer
-    if not (place := better_turn(problem, pictures, run.full(), run.plan.other_starts)):
+    if not (place := better_turn(problem, pictures, run.full(), rotations)):
         return ""
     assert isinstance(optimizer, Partitioned)
     run.parameters = {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}}

@@ -62,14 +62,12 @@ def better_turn(
                 better.append((turn, losses))
         if better:
             least = min((losses for _, losses in better), key=lambda losses: mean_and_error(losses)[0])
-            chosen[key], best = next(each for each in better if _is_as_good(each[1], least, pictures.sampled))
+            rises = [difference(least, losses, sampled=pictures.sampled) for _, losses in better]
+            chosen[key], best = next(
+                each for each, rise in zip(better, rises, strict=True) if rise.value <= _EQUAL * rise.standard_error
+            )
     start, total = mean_and_error(first)[0], mean_and_error(best)[0]
     return Place(chosen, max(total, 0.0) / start, total) if chosen and start > 0.0 else None
-
-
-def _is_as_good(losses: np.ndarray, least: np.ndarray, sampled: bool) -> bool:
-    change = difference(least, losses, sampled=sampled)
-    return losses is least or change.value <= _EQUAL * change.standard_error
 
 
 def turns(value: np.ndarray) -> list[np.ndarray]:
