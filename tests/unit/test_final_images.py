@@ -25,6 +25,7 @@ from unrender.core import phases
 from unrender.estimators.fresh_pictures import Residuals
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.rendering.picture_format import PictureFormat
 from unrender.rendering.renderer import ParameterInfo
 from unrender.runs import determination, final_checks, final_images, joint_maps, least_squares
 from unrender.runs.callbacks import RUN_PHASES, Callback
@@ -504,6 +505,7 @@ def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: s
         ((1.0, 1.1, 1.0), 0, ""),
         ((1.3, 1.3, 1.3), 0, ""),
         ((1.0, 1.3, 1.0), 6, ""),
+        ((1.0, 0.0, 1.0), 0, ""),
     ],
 )
 def test_references_of_unequal_brightness_are_named(factors: tuple[float, ...], shift: int, words: str) -> None:
@@ -516,9 +518,15 @@ def test_references_of_unequal_brightness_are_named(factors: tuple[float, ...], 
     ends = [[1.1 * x + random.normal(0.0, 0.02, x.shape) for _ in range(2)] for x in images]
     ends[1][0][5, 5] = np.nan
     made: Any = SimpleNamespace(
-        views=[SimpleNamespace(reference=x) for x in references], test_weights=lambda *of: np.ones((24, 24))
+        renderer=SimpleNamespace(formats=lambda: formats),
+        views=[SimpleNamespace(reference=x, sensor=sensor) for sensor, x in enumerate(references)],
+        test_weights=lambda *of: np.ones((24, 24)),
     )
+    formats = [PictureFormat() for _ in factors]
     assert unequal_brightness(made, range(len(factors)), ends) == words
+    assert not unequal_brightness(made, range(len(factors)), [[of[0]] for of in ends])
+    formats[1:] = [PictureFormat(aov="depth") for _ in formats[1:]]
+    assert not unequal_brightness(made, range(len(factors)), ends)
 
 
 def misplaced_among(references: list[np.ndarray], images: list[np.ndarray], weights: np.ndarray) -> str:

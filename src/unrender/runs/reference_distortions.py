@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.core.text import listed
 from unrender.display import formatting
+from unrender.rendering.picture_format import format_of
 from unrender.runs.verification import STEPS
 from unrender.statistics import scores
 from unrender.statistics.paired_losses import slices_of_images
@@ -181,25 +182,29 @@ def misplaced(
 def unequal_brightness(problem: Problem, views: Sequence[int], ends: Sequence[Sequence[np.ndarray]]) -> str:
     """Return words about the views of the darkest and the brightest reference relative to their pictures, as exposures that differ cause
     them; "" unless one factor for each view explains most of the difference, and both halves of the pictures of the end tell the same.
+    Views of AOVs have no brightness, and black references no exposure.
     """
-    factors, explained, total = [], 0.0, 0.0
+    factors: dict[int, list[float]] = {}
+    explained, total = 0.0, 0.0
     for view, images in zip(views, ends, strict=True):
+        if format_of(problem.renderer, problem.views[view].sensor).aov or len(images) < 2:
+            continue
         one, other = np.mean(images[0::2], axis=0), np.mean(images[1::2], axis=0)
         reference = np.asarray(problem.views[view].reference, np.float64)
         weights = problem.test_weights(view, images)[..., None] * np.isfinite(one + other)
         one, other, reference = (np.where(weights > 0.0, x, 0.0) for x in (one, other, reference))
         square = max(float((weights * one * other).sum()), 1e-300)
         products = [float((weights * reference * half).sum()) for half in (one, other)]
-        factors.append([max(product, 0.0) / square for product in products])
+        factors[view] = [max(product, 0.0) / square for product in products]
         explained += (sum(products) / 2 - square) ** 2 / square
         total += float((weights * (reference - one) * (reference - other)).sum())
-    means = [max(sum(of) / 2, 1e-300) for of in factors]
-    dark, bright = int(np.argmin(means)), int(np.argmax(means))
-    least = min(factors[bright]) / max(*factors[dark], 1e-300)
-    if len(views) < 2 or not explained > _MOSTLY * total or not least > 1.0 + _BRIGHTER:
+    if len(factors) < 2 or not explained > _MOSTLY * total:
         return ""
-    times = formatting.number(round(means[bright] / means[dark], 2))
-    return f"{AS_IF} {views[bright]} were {times} times as bright as that of view {views[dark]}"
+    dark, bright = (one_of(factors, key=lambda view: sum(factors[view])) for one_of in (min, max))
+    if not min(factors[bright]) > (1.0 + _BRIGHTER) * max(factors[dark]) > 0.0:
+        return ""
+    times = formatting.number(round(sum(factors[bright]) / sum(factors[dark]), 2))
+    return f"{AS_IF} {bright} were {times} times as bright as that of view {dark}"
 
 
 def _unexplained(image: np.ndarray, weights: np.ndarray, reference: np.ndarray) -> float:
