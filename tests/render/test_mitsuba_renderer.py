@@ -118,6 +118,21 @@ def test_states_of_a_batch_set_the_values_that_change(monkeypatch: pytest.Monkey
     assert (alone[0] > 1.5 * images[0]).any()
 
 
+def test_values_of_an_update_that_failed_are_set_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    states, request = [{WALL: np.full((1, 8, 8, 3), x, np.float32)} for x in (0.2, 0.8)], SampleRequest(0, 2, 1)
+    fresh, session = (MitsubaRenderer(box()).prepare([WALL], None, derivatives=False) for _ in range(2))
+    expected = fresh.image_batch(states[1], request).numpy()
+    session.image_batch(states[0], request)
+    with monkeypatch.context() as patched:
+        patched.setattr(mi.SceneParameters, "update", fails)
+        with pytest.raises(RuntimeError):
+            session.image_batch(states[1], request)
+    np.testing.assert_array_equal(session.image_batch(states[1], request).numpy(), expected)
+
+
 CV = ur.images.RecursiveControlVariate
 STEADY: dict[str, tuple[Any, int]] = {
     # estimator, kernels that the thirty steps after the tenth may still add: Dr.Jit orders the inputs of some in several ways

@@ -240,10 +240,10 @@ class LoadedScene:
                 self.parameters.update()
                 self._notify(changed)
         except RuntimeError as error:
-            if not _OF_MITSUBA.search(str(error)):
-                raise
             for key in changed:  # the scene's state is inconsistent with these values
                 self._settings[key] = replace(self._settings[key], spent=True)
+            if not _OF_MITSUBA.search(str(error)):
+                raise
             raise InputError(
                 f"{', '.join(changed)}: Mitsuba refuses the value; give the parameter bounds: {reason_of(error, 200)}"
             ) from error
