@@ -118,7 +118,7 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
     sizes = renderer.resolutions()
     references = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
     for sensor in sensors:
-        if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
+        if not 0 <= sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
             raise InputError(f"Renderer: sensor must be {have}, got {in_words(sensor)}")
 

@@ -182,7 +182,7 @@ class Renderer:
             sensor: index of a sensor; None for the renderer's first one.
             seed: seed of the image, independent of the renderer's.
         """
-        chosen = self._options.sensors[0] if sensor is None else sensor
+        chosen = self._options.sensors[0] if sensor is None else checks.integer("Renderer", "sensor", sensor, 0)
         problem = problem_of(self._port, self._options, (chosen,), self._scene)
         return render_view(problem, numpy(self._exchange.tree(self._exchange.read(values))), 0, spp, seed)
 
