@@ -199,7 +199,7 @@ def test_several_sensors_have_a_state_each() -> None:
     assert set(one.state.streams) == {"0", "1"}
     with pytest.raises(InputError, match="sensor must be 0 to 1, got 2"):
         one.render(START, sensor=2)
-    assert one.preview(START, sensor=np.int64(1)).shape == REFERENCE.shape
+    assert one.preview(START, sensor=np.int64(1)).shape == REFERENCE.shape  # pyright: ignore[reportArgumentType]
 
 
 def test_a_mini_batch_says_its_pixels() -> None:
