@@ -14,8 +14,10 @@ from drjit.llvm.ad import Array3f
 
 from tests.analytic import AnalyticRenderer
 from unrender import losses, methods
+from unrender.backend.variant import unsupported
 from unrender.core import registry
 from unrender.core.errors import InputError
+from unrender.images.denoising import choose
 from unrender.io import write_grid
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.renderer import ParameterInfo
@@ -471,34 +473,38 @@ def test_parameters_of_arrays_can_be_compared() -> None:
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize(
-    "huge", [10**5000, [10**5000], {"a": 10**5000}, [10**400] * 3], ids=["number", "list", "table", "float"]
+    "wrong",
+    [10**5000, [10**5000], {"a": 10**5000}, [10**400] * 3, np.ones((2, 2))],
+    ids=["number", "list", "table", "float", "array"],
 )
-def test_integers_that_python_neither_prints_nor_converts_are_one_line(huge: Any, tmp_path: Path):
-    """As values of every argument and option. Python prints no more than 4300 digits, and a float has at most 308."""
+def test_values_that_python_neither_prints_converts_nor_compares_are_one_line(wrong: Any, tmp_path: Path):
+    """As values of every argument and option. Python prints at most 4300 digits, a float has 308, and an array has no truth value."""
 
     def attempt(make: Any, *given: Any, **options: Any) -> None:
         with contextlib.suppress(InputError):
             make(*given, **options)
 
     for name in inspect.signature(Parameter).parameters:
-        attempt(lambda name=name: problem([Parameter(**{"key": "wall.value", name: huge})]))
+        attempt(lambda name=name: problem([Parameter(**{"key": "wall.value", name: wrong})]))
     for name in inspect.signature(View).parameters:
-        attempt(lambda name=name: problem(views=[View(**{"reference": REFERENCE, name: huge})]))
+        attempt(lambda name=name: problem(views=[View(**{"reference": REFERENCE, name: wrong})]))
     for name in ("max_depth", "loss", "truth", "surfaces", "expressions", "name"):
-        attempt(problem, **{name: huge})
-    attempt(problem, truth={"wall.value": huge})
+        attempt(problem, **{name: wrong})
+    attempt(problem, truth={"wall.value": wrong})
     for name in ("parameters", "spp", "seed", "view", "per_pass"):
-        attempt(render, problem(), **{name: huge})
-    attempt(render, problem(), {"wall.value": huge})
-    attempt(write_grid, tmp_path / "a.vol", huge)
-    attempt(write_grid, tmp_path / "a.vol", np.ones((1, 1, 1)), [huge] * 6)
+        attempt(render, problem(), **{name: wrong})
+    attempt(render, problem(), {"wall.value": wrong})
+    attempt(choose, wrong)
+    attempt(unsupported, wrong)
+    attempt(write_grid, tmp_path / "a.vol", wrong)
+    attempt(write_grid, tmp_path / "a.vol", np.ones((1, 1, 1)), [wrong] * 6)
     with pytest.raises(InputError, match="got list with an integer of more than 4300 digits"):
         problem([Parameter("wall.value", initial=[10**5000])])
     with pytest.raises(InputError, match="prior: near must have finite numbers"):
         problem([Parameter("wall.value", prior={"near": 10**400, "std": 1})])
     for method in map(methods.method, methods.methods()):
         for name in method.options.model_fields:
-            attempt(method.configure, {name: huge})
+            attempt(method.configure, {name: wrong})
     tables = ("largest", "weights", "others")  # only mappings and components are taken
     for made_by in (each for kind in registry.KINDS if kind != "method" for each in registry.components(kind).values()):
         known = inspect.signature(made_by).parameters
@@ -506,4 +512,4 @@ def test_integers_that_python_neither_prints_nor_converts_are_one_line(huge: Any
             name: 1 for name, of in known.items() if of.default is of.empty and of.kind is of.POSITIONAL_OR_KEYWORD
         }
         for name in known.keys() - set(tables):
-            attempt(made_by, **{**needed, name: huge})
+            attempt(made_by, **{**needed, name: wrong})

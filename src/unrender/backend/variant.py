@@ -155,11 +155,8 @@ def with_colours_of(variant: str, other: str | None) -> str:
 
 def unsupported(variant: str) -> str:
     """Return why a name is neither "auto" nor a supported variant, and what was expected, in one line; "" if it is."""
-    return (
-        ""
-        if variant in ("auto", *VARIANTS)
-        else f"{_lacking(variant if isinstance(variant, str) else in_words(variant))}{_EXPECTED}"
-    )
+    name = variant if isinstance(variant, str) else in_words(variant)
+    return "" if name in ("auto", *VARIANTS) else f"{_lacking(name)}{_EXPECTED}"
 
 
 def _lacking(variant: str) -> str:

@@ -141,6 +141,11 @@ class HybridGradient:
 
     def __post_init__(self):
         checks.fields(self)
+        for name in ("keys", "eliminated") if self.keys is not None else ("eliminated",):
+            keys: Any = getattr(self, name)
+            if isinstance(keys, str) or not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
+                raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {in_words(keys)}")
+            object.__setattr__(self, name, tuple(keys))
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
             raise InputError(
                 f"HybridGradient: path must be an estimator, such as PathGradient(), got {in_words(self.path)}"
@@ -165,11 +170,6 @@ class HybridGradient:
             raise InputError(
                 f"HybridGradient: averaged needs a path that provides a variance, such as MetaEstimator(), got {type(self.path).__name__}"
             )
-        for name in ("keys", "eliminated") if self.keys is not None else ("eliminated",):
-            keys: Any = getattr(self, name)
-            if isinstance(keys, str) or not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
-                raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {in_words(keys)}")
-            object.__setattr__(self, name, tuple(keys))
         if isinstance(self.perturbed, GaussNewton):
             if self.eliminated and self.perturbed.remember:
                 raise InputError(

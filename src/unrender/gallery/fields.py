@@ -64,7 +64,7 @@ def choice(default: str, about: str, among: tuple[str, ...]) -> Any:
     """Return a dataclass field of an `Option`: one of the words `among`."""
 
     def check(owner: str, name: str, value: Any) -> str:
-        if value not in among:
+        if not isinstance(value, str) or value not in among:
             raise InputError(f"{owner}: {name} must be one of {', '.join(among)}, got {in_words(value)}")
         return value
 

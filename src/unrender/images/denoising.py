@@ -44,7 +44,7 @@ def choose(by: Denoiser = "auto") -> Denoiser:
     Raises:
         InputError: the name is unknown, or the denoiser is not available; the message says what to install.
     """
-    if by not in ("auto", *_DENOISERS):
+    if not isinstance(by, str) or by not in ("auto", *_DENOISERS):
         known = ("auto", *_DENOISERS)
         raise InputError(f"denoiser {in_words(by)}: expected {', '.join(known)}{did_you_mean(by, known)}")
     if by == "auto":

@@ -264,7 +264,7 @@ def check_remeshing(value: Any, mesh: _Arrays | None, uv: Callable[[], np.ndarra
 
 def check_self_intersection(choice: Any, mesh: _Arrays | None) -> None:
     """Raise `InputError` for an invalid treatment of self-intersections; see `Parameter`."""
-    if choice not in _SELF_INTERSECTIONS:
+    if not isinstance(choice, str) or choice not in _SELF_INTERSECTIONS:
         raise InputError(f'expected "warn", "prevent" or "ignore", got {in_words(choice)}')
     if choice != "warn" and mesh is None:
         raise InputError(_NO_MESH)

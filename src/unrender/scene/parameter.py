@@ -73,8 +73,9 @@ class Parameter:
     keys: Sequence[str] | Mapping[str, float] | None = None
 
     def __post_init__(self):
-        if not self.key and self.keys and not isinstance(self.keys, str):
-            object.__setattr__(self, "key", next(iter(self.keys)))
+        keys = self.keys if isinstance(self.keys, (Sequence, Mapping)) and not isinstance(self.keys, str) else ()
+        if keys and isinstance(self.key, str) and not self.key:
+            object.__setattr__(self, "key", next(iter(keys)))
 
 
 @dataclass(frozen=True)

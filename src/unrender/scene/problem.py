@@ -133,7 +133,7 @@ class Problem(ViewLosses):
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
         renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions)
-        unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
+        unknowns = _unknowns(checked_parameters, renderer, truth or {}, {} if surfaces is None else surfaces)
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         if not partial:
             check_determined(original_views, located, renderer, list(unknowns))

@@ -60,10 +60,10 @@ def check_max_depth(max_depth: Any) -> None:
     """Raise `FieldError` unless the argument is a maximum path length or None."""
     if max_depth is None:
         return
-    if isinstance(max_depth, bool) or not isinstance(max_depth, (int, np.integer)) or max_depth < 1:
-        hint = "; for Mitsuba's -1 (no limit) use a large number such as 64" if max_depth == -1 else ""
-        shown = in_words(max_depth)
-        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {shown}{hint}")
+    whole = isinstance(max_depth, (int, np.integer)) and not isinstance(max_depth, bool)
+    if not whole or max_depth < 1:
+        hint = "; for Mitsuba's -1 (no limit) use a large number such as 64" if whole and max_depth == -1 else ""
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {in_words(max_depth)}{hint}")
     if max_depth > _DEEPEST:
         raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(int(max_depth)), 60)}")
 

@@ -62,7 +62,9 @@ def of_views(
             check_sensor(index, view, len(own.resolutions()))
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
-        worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters(), keys))
+        worlds[index] = World(
+            own, view.sensor, _values(index, {} if view.known is None else view.known, own.parameters(), keys)
+        )
     made, sensors = with_worlds(renderer, list(worlds.values()), len(worlds) < len(views))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
@@ -179,7 +181,7 @@ def _opened(
 
 def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
     place, owner = ("views", index, "aov"), f"view {index}: aov"
-    if name not in AOVS:
+    if not isinstance(name, str) or name not in AOVS:
         raise FieldError(place, f"expected one of {', '.join(AOVS)}, got {in_words(name)}", owner)
     if isinstance(own, AovRenderer):
         with FieldError.at(place, owner):
