@@ -118,9 +118,10 @@ def test_states_of_a_batch_set_the_values_that_change(monkeypatch: pytest.Monkey
     assert (alone[0] > 1.5 * images[0]).any()
 
 
-def test_values_of_an_update_that_failed_are_set_again(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [RuntimeError("out of memory"), KeyboardInterrupt()])
+def test_values_of_an_update_that_failed_are_set_again(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(_: Any) -> None:
-        raise RuntimeError("out of memory")
+        raise error
 
     states, request = [{WALL: np.full((1, 8, 8, 3), x, np.float32)} for x in (0.2, 0.8)], SampleRequest(0, 2, 1)
     fresh, session = (MitsubaRenderer(box()).prepare([WALL], None, derivatives=False) for _ in range(2))
@@ -128,7 +129,7 @@ def test_values_of_an_update_that_failed_are_set_again(monkeypatch: pytest.Monke
     session.image_batch(states[0], request)
     with monkeypatch.context() as patched:
         patched.setattr(mi.SceneParameters, "update", fails)
-        with pytest.raises(RuntimeError):
+        with pytest.raises(type(error)):
             session.image_batch(states[1], request)
     np.testing.assert_array_equal(session.image_batch(states[1], request).numpy(), expected)
 

@@ -239,10 +239,10 @@ class LoadedScene:
             with _without_warnings():
                 self.parameters.update()
                 self._notify(changed)
-        except RuntimeError as error:
+        except BaseException as error:  # an interrupt too
             for key in changed:  # the scene's state is inconsistent with these values
                 self._settings[key] = replace(self._settings[key], spent=True)
-            if not _OF_MITSUBA.search(str(error)):
+            if not isinstance(error, RuntimeError) or not _OF_MITSUBA.search(str(error)):
                 raise
             raise InputError(
                 f"{', '.join(changed)}: Mitsuba refuses the value; give the parameter bounds: {reason_of(error, 200)}"
