@@ -176,12 +176,26 @@ def test_turns_are_compositions_of_rotations() -> None:
     np.testing.assert_allclose(np.exp(1j * (angles - 0.5)), np.exp(0.25j * np.pi * np.arange(1, 8)), atol=1e-6)
 
 
+def few_numbers(bounds: tuple[float, float] | None = None) -> ur.Problem:
+    others = [
+        ur.Parameter("block.translation.x", initial=0.1, bounds=(-0.2, 0.2)),
+        ur.Parameter("lamp.intensity.value", initial=[4.0] * 3),
+    ]
+    return ur.Problem(room(), [ur.Parameter(TURN, initial=1.9, bounds=bounds), *others], turned(1.9).views, max_depth=3)
+
+
 def test_translations_beside_rotations_are_not_turned(monkeypatch: pytest.MonkeyPatch) -> None:
     """They were taken for angles, beyond their bounds, where a block of poses and all other unknowns were few numbers."""
-    few = [ur.Parameter("block.translation.x", bounds=(-0.2, 0.2)), ur.Parameter("lamp.intensity.value")]
-    made = ur.Problem(room(), [ur.Parameter(TURN, initial=1.9), *few], turned(1.9).views, max_depth=3)
-    plan, compared = method("auto").plan(made), []
+    made, compared = few_numbers(), []
+    plan = method("auto").plan(made)
     assert plan.other_starts == (TURN, "block.translation.x")
     monkeypatch.setattr(refinement, "better_turn", lambda problem, pictures, values, keys: compared.append(keys))
     ur.optimize(made, plan, steps=17)
     assert compared == [(TURN,)]
+
+
+def test_a_block_that_begins_at_other_values_does_not_wait_again() -> None:
+    """It waited for another 20 steps, so a run of 30 ended where it began again."""
+    result = ur.optimize(few_numbers((-3.3, 3.3)), steps=24, seed=1)
+    assert any("begins again after step 16 with other values" in line for line in result.adapted)
+    assert np.sin(result.last[TURN]) == pytest.approx(0.0, abs=0.05)

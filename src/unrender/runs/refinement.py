@@ -17,7 +17,7 @@ from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.estimators.hybrid import HybridGradient, beyond_paths
+from unrender.estimators.hybrid import HybridGradient, HybridState, beyond_paths
 from unrender.methods.rules.starts import Place, better_place, number_of_places
 from unrender.methods.rules.turns import better_turn, number_of_turns, turned_keys
 from unrender.optimizers.partitioned import Partitioned
@@ -245,7 +245,10 @@ def _moved(run: Run, pictures: FreshPictures) -> str:
     lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]
     if not (place := better_place(problem, pictures, values, keys, lights)):
         return ""
+    before = run.state.estimator
     begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})
+    if isinstance(before, HybridState):  # a block does not wait again
+        run.state.estimator = replace(run.state.estimator, step=before.step)
     run.state.numbers = NumberTrace()
     return f"{BEGUN_AGAIN} {run.step} with other values of {listed(list(keys))}, {_loss(place)}"
 
