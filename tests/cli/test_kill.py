@@ -156,7 +156,8 @@ def kill_command(tmp_path: Path, name: str, seed: int) -> None:
         tried += 1
         assert tried < 10
         folder = tmp_path / str(tried)
-        line: list[object] = ["run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3))]
+        begin = ["run", *words, "--out", folder, "--checkpoint-every"]
+        line: list[object] = [*begin, dice.choice((1, 3))]
         for first, last in ((-3, COMMAND_STEPS // 2), (COMMAND_STEPS // 2, COMMAND_STEPS)):
             process = command(*line)
             wait_for_steps(process, folder, dice.randint(first, last))
@@ -171,7 +172,7 @@ def kill_command(tmp_path: Path, name: str, seed: int) -> None:
             done = ("finished", WORSE, MEMORY_DISAGREES)
             if begun and json.loads((folder / "run.json").read_text())["status"] in done:
                 break  # it died while it wrote its page, and is refused: there is nothing to go on with
-            line = ["resume", folder] if begun else [*line[:-1], 5, "--overwrite"]
+            line = ["resume", folder] if begun else [*begin, 5, "--overwrite"]
         else:
             killed = True
     assert finish(command(*line)) == status, tried
