@@ -12,7 +12,7 @@
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
 #   PYTHON=python3.12   the interpreter, 3.10 to 3.14
-#   WORKERS=4           test processes; one for each core, at most 4, unless said otherwise
+#   WORKERS=4           test processes; one more than cores, at most 4, unless said otherwise
 #   DRJIT_CACHE_DIR=x   the folder that keeps compiled kernels, .pytest_cache/kernels; in an empty one a run takes twice the time
 #   SECONDS=30          of the demo, per method; of the asset, of all stages together
 
@@ -25,8 +25,9 @@ FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 
 PYTHON ?= $(shell $(FIND_PYTHON))
 BIN := .venv/bin
 SECONDS := 30
-# LLVM compiles a kernel on one core, so a process for each. The tests of a file stay in one process, since they share kernels.
-WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
+# LLVM compiles a kernel on one core, so a process for each, and one more, since some tests wait for processes that they start. The tests of a
+# file stay in one process, since they share kernels.
+WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$((n + 1)) || echo 4)
 PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=2
 TYPES = $(BIN)/pyright --pythonpath $(BIN)/python
 # Types of the sources take half a minute of one core: they are checked beside the tests, told after them, and checked again only if a source or
