@@ -43,15 +43,15 @@ class Console(console.Console):
         self.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
-def columns(*headings: str) -> Table:
-    """Return a table without lines: with these headings, or of two columns of names and values."""
+def columns(*headings: str, width: int | None = None) -> Table:
+    """Return a table without lines: with these headings, or of two columns of names and values, the former of this width in characters."""
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold", show_header=bool(headings))
     for heading in headings:
         table.add_column(Text(visible(heading)), overflow="fold")
     if not headings:
-        table.add_column(style="bold", overflow="fold")
+        table.add_column(style="bold", overflow="fold", width=width)
         table.add_column(overflow="fold")
     return table
 

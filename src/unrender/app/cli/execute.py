@@ -156,7 +156,8 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
 
 
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
-    table = columns()
+    longest = max(len(f"= {key}") for key in problem.unknowns)
+    table = columns(width=max(min(longest, console.width * 11 // 20), len("image error")))
     table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s, without compiling")
     if result.skipped:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
