@@ -6,7 +6,6 @@ other folders have the mark without saying so.
 
 from __future__ import annotations
 
-import functools
 import gc
 import os
 import sys
@@ -97,28 +96,12 @@ def mitsuba_variant() -> str:
         pytest.exit(str(error), returncode=3)  # once, not once per test
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        # Each worker would start a thread per core. Threads that wait for work take up to half of the processor time of small pictures.
-        lend_threads_to_openexr()
-        dr.set_thread_count(max(1, dr.thread_count() // workers))
+        # Each worker would start a thread per core, and they would wait for each other. With one thread, reads and writes of OpenEXR
+        # hang, and so do two threads of Python of which one loads a scene while the other renders.
+        dr.set_thread_count(max(2, dr.thread_count() // workers))
     count_scenes()
     gc.freeze()  # Mitsuba's module, and no scene yet
     return name
-
-
-def lend_threads_to_openexr() -> None:
-    """With one thread, Mitsuba's OpenEXR deadlocks. `mi.Bitmap(path)` cannot be replaced: tests read files by `unrender.io.images`."""
-    import mitsuba as mi
-
-    def lent(function: Any) -> Any:
-        @functools.wraps(function)
-        def called(*arguments: Any, **options: Any) -> Any:
-            with variant.two_threads():
-                return function(*arguments, **options)
-
-        return called
-
-    for owner, name in ((mi.Bitmap, "write"), (mi, "load_dict"), (mi, "load_file"), (mi, "load_string")):
-        setattr(owner, name, lent(getattr(owner, name)))
 
 
 def count_scenes() -> None:
