@@ -76,6 +76,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             super().remove_node(node)
             return ended
 
+        def _reschedule(self, node: Any) -> None:
+            # A process runs its last test when it knows the next one, or that there is none. Files of one that ended come back without
+            # the tests that are done, so that some have none left, and the others waited for ever.
+            super()._reschedule(node)
+            while not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
+                super()._reschedule(node)
+
     return Once(config, log) if config.getoption("dist") == "loadfile" else None
 
 
