@@ -156,7 +156,7 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
 
 
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
-    longest = max(len(f"= {key}") for key in problem.unknowns)
+    longest = max((len(f"= {key}") for key in problem.unknowns), default=0)
     table = columns(width=max(min(longest, console.width * 11 // 20), len("image error")))
     table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s, without compiling")
     if result.skipped:
