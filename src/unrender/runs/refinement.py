@@ -7,7 +7,7 @@ variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -151,6 +151,18 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
     )
 
 
+def _restart(run: Run, keys: Iterable[str]) -> None:
+    """Restart the states after some unknowns have changed; of a `Partitioned` optimizer, only those that these keys belong to."""
+    state, optimizer = run.state, run.optimizer
+    fresh = optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
+    state.estimator = restarted(state.estimator, run.estimator.init(run.problem, run.parameters))
+    partitioned = isinstance(optimizer, Partitioned)
+    state.optimizer = (
+        optimizer.restarted(state.optimizer, fresh, keys) if partitioned else restarted(state.optimizer, fresh)
+    )
+    state.noise = GradientNoise()
+
+
 class MeshRefinement(Callback):
     """Callback that remeshes before the steps in `Parameter.remeshing`, or warns and keeps the mesh. Compiling counts as warm-up."""
 
@@ -183,13 +195,7 @@ class MeshRefinement(Callback):
         unchanged = {key: arrays.numpy(value) for key, value in run.parameters.items() if key not in meshes}
         values = {key: unchanged.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
         run.parameters = {key: run.problem.renderer.array(value) for key, value in values.items()}
-        fresh = run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
-        state.estimator = restarted(state.estimator, run.estimator.init(run.problem, run.parameters))
-        before = state.optimizer
-        state.optimizer = restarted(before, fresh)
-        if isinstance(run.optimizer, Partitioned):
-            state.optimizer = run.optimizer.restarted(before, fresh, meshes)
-        state.noise = GradientNoise()
+        _restart(run, meshes)
         run.description["meshes"] = arrays_of(run.problem, run.description["meshes"])
         arrays.evaluate(run.parameters, state.estimator, state.optimizer)
         run.warmup_seconds += time.perf_counter() - started + warm_up(run)[0]
@@ -255,16 +261,13 @@ def _moved(run: Run, pictures: FreshPictures) -> str:
 
 def _turned(run: Run, pictures: FreshPictures, rotations: Sequence[str]) -> str:
     """Let the block of poses begin again where shapes are turned, if that picture is better. Returns a line about it, or ""."""
-    problem, state, optimizer = run.problem, run.state, run.optimizer
+    problem = run.problem
     if not (place := better_turn(problem, pictures, run.full(), rotations)):
         return ""
-    assert isinstance(optimizer, Partitioned)
     run.parameters = {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}}
     arrays.evaluate(run.parameters)
-    fresh = optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
-    state.optimizer = optimizer.restarted(state.optimizer, fresh, optimizer.keys)
-    state.estimator = restarted(state.estimator, run.estimator.init(problem, run.parameters))
-    state.numbers, state.noise = NumberTrace(), GradientNoise()
+    _restart(run, rotations)
+    run.state.numbers = NumberTrace()
     return f"{BEGUN_AGAIN} {run.step} with other turns of {listed(list(place.values))}, {_loss(place)}"
 
 
