@@ -12,9 +12,7 @@ from typing import Protocol
 
 from unrender.core import checks
 from unrender.core.checks import Count, NotNegative, Positive
-from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.core.text import in_words
 
 __all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]
 
@@ -131,7 +129,7 @@ class Steps(checks.Checked):
 
 @register(position=6)
 @dataclass(frozen=True)
-class Warmup:
+class Warmup(checks.Checked):
     """A linear increase over the first `steps` steps, 1/steps, 2/steps … 1, followed by another schedule from its step 0.
 
     Args:
@@ -141,11 +139,6 @@ class Warmup:
 
     steps: Count
     then: Schedule | None = None
-
-    def __post_init__(self):
-        checks.fields(self)
-        if self.then is not None and not callable(self.then):
-            raise InputError(f"Warmup: then must be a schedule or None, got {in_words(self.then)}")
 
     def __call__(self, step: float) -> float:
         if step < self.steps:

@@ -140,10 +140,34 @@ def test_callbacks_of_another_kind_are_refused_in_one_line(callbacks: Any) -> No
         ur.optimize(problem(), steps=1, callbacks=callbacks)
 
 
-def test_a_path_in_place_of_a_problem_is_refused_in_one_line() -> None:
-    path: Any = "room.toml"
-    with pytest.raises(ur.InputError, match="optimize: expected a Problem, such as"):
-        ur.optimize(path, steps=1)
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda x: ur.optimize(x, steps=1), "optimize"),
+        (lambda x: ur.estimate(x, ur.PathGradient()), "estimate"),
+        (lambda x: ur.render(x), "render"),
+        (lambda x: ur.render_pair(x, {}, {}, 1, 0), "render_pair"),
+    ],
+)
+@pytest.mark.parametrize("wrong", ["room.toml", None, ur.Problem])
+def test_a_path_in_place_of_a_problem_is_refused_in_one_line(call: Any, name: str, wrong: Any) -> None:
+    with pytest.raises(ur.InputError, match=f"^{name}: expected a Problem, such as"):
+        call(wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"annotations": "a run"}, "optimize: annotations: expected a RunAnnotations, got 'a run'"),
+        ({"annotations": np.zeros(2)}, r"optimize: annotations: expected a RunAnnotations, got array\(\[0., 0.\]\)"),
+        ({"progress": "yes"}, "optimize: progress must be true or false, got 'yes'"),
+        ({"run_directory": "a\0b"}, r"optimize: run_directory: expected a folder, got 'a\\x00b'"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_in_one_line(options: Any, expected: str) -> None:
+    parts = (ur.PathGradient(spp=2), ur.optimizers.Adam(0.01))
+    with pytest.raises(ur.InputError, match=f"^{expected}$"):
+        ur.optimize(problem(), *parts, steps=1, **options)
 
 
 def test_a_callback_may_add_arrays_to_the_history_and_return_nothing(tmp_path: Path) -> None:

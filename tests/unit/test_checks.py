@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+import unrender as ur
 from unrender.core import checks, registry
-from unrender.core.checks import Count, Fraction, Index, NotNegative, OpenFraction, Positive, Seed, Several
+from unrender.core.checks import (
+    Count,
+    Fraction,
+    Index,
+    NotNegative,
+    OpenFraction,
+    Positive,
+    PositiveByKey,
+    Seed,
+    Several,
+)
 from unrender.core.errors import InputError
 
-RANGES = ("Positive", "NotNegative", "Fraction", "OpenFraction", "Index", "Seed", "Count", "Several", "bool", "Literal")
+RANGES = (
+    "Positive",
+    "PositiveByKey",
+    "NotNegative",
+    "Fraction",
+    "OpenFraction",
+    "Index",
+    "Seed",
+    "Count",
+    "Several",
+    "bool",
+    "Literal",
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +52,7 @@ class Options(checks.Checked):
     flag: bool = False
     kind: Literal["a", "b"] | Literal["c"] | None = "a"
     free: Any = None
+    weights: PositiveByKey = field(default_factory=dict)
 
 
 def test_values_within_the_ranges_are_taken() -> None:
@@ -64,6 +89,9 @@ def test_numbers_of_numpy_become_pythons() -> None:
         ("flag", 1, "flag must be true or false, got 1"),
         ("kind", np.zeros(2), 'kind must be "a", "b" or "c", got array([0., 0.])'),
         ("kind", "d", """kind must be "a", "b" or "c", got 'd'"""),
+        ("weights", 1.0, "weights must be numbers by key, {key: number}, got 1.0"),
+        ("weights", {1: 1.0}, "weights must be numbers by key, {key: number}, got {1: 1.0}"),
+        ("weights", {"k": "1"}, "weights of k must be a finite number > 0, got '1'"),
     ],
 )
 def test_others_are_refused_by_name(name: str, value: Any, expected: str) -> None:
@@ -88,3 +116,61 @@ def test_every_annotated_range_of_a_component_is_found() -> None:
                 words = str(each.type).replace(" | None", "")
                 if words in RANGES or words.startswith("Literal["):
                     assert each.name in found, (cls, each.name)
+
+
+@pytest.mark.mitsuba
+def test_values_of_other_types_for_a_field_of_a_component_are_one_line() -> None:
+    """No field may raise Python's own error, and one for a component may not wait for the run to find that it is none."""
+    wrong = [
+        "abc",
+        None,
+        [1, "a"],
+        {"a": 1},
+        {1: 2},
+        object(),
+        int,
+        10**400,
+        np.zeros(3),
+        b"x",
+        lambda *_: None,
+        [[1], [2, 3]],
+    ]
+    for name, made_by in registry.table_components().items():
+        parts = [each for each in fields(made_by) if each.init]
+        needed = {each.name: 3 for each in parts if each.default is MISSING and each.default_factory is MISSING}
+        for each in parts:
+            refused = 0
+            for value in wrong:
+                try:
+                    made_by(**(needed | {each.name: value}))
+                except InputError:
+                    refused += 1
+                except Exception as error:
+                    raise AssertionError(f"{name}: {each.name}={value!r}") from error
+            assert refused >= len(wrong) - 3, f"{name}: {each.name} takes anything"
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(
+    ("made", "expected"),
+    [
+        (lambda x: ur.PathGradient(image=x), "PathGradient: image must be one of unrender.images, got 'rcv'"),
+        (
+            lambda x: ur.optimizers.Partitioned(others=x),
+            "Partitioned: others must be one of unrender.optimizers, got 'rcv'",
+        ),
+        (lambda x: ur.optimizers.Successive(then=x), "Successive: then must be an AveragedNewton, got 'rcv'"),
+        (
+            lambda x: ur.estimators.HybridGradient(perturbed=x),
+            "HybridGradient: perturbed must be a SmoothedDerivatives or a GaussNewton, got 'rcv'",
+        ),
+        (
+            lambda x: ur.optimizers.ScheduleFree(preconditioner=x),
+            "ScheduleFree: preconditioner must be one of unrender.preconditioners or None, got 'rcv'",
+        ),
+    ],
+)
+def test_components_of_another_kind_are_refused_by_name(made: Callable[[Any], Any], expected: str) -> None:
+    with pytest.raises(InputError) as error:
+        made("rcv")
+    assert str(error.value) == expected

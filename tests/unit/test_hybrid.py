@@ -370,7 +370,7 @@ def wrong(given: Any) -> Any:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda: ur.estimators.HybridGradient(wrong(ur.PathGradient)), "path must be an estimator"),
+        (lambda: ur.estimators.HybridGradient(wrong(ur.PathGradient)), "path must be one of unrender.estimators"),
         (lambda: ur.estimators.HybridGradient(ur.SmoothedDerivatives(0.1)), "of path gradients"),
         (lambda: ur.estimators.HybridGradient(ur.estimators.LossValues()), "of path gradients"),
         (lambda: ur.estimators.HybridGradient(perturbed=ur.SmoothedDerivatives(0.1, order="hvp")), "no curvature"),

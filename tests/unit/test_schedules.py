@@ -44,7 +44,7 @@ def test_closed_form(schedule, factors):
         (lambda: Steps(2.5), "Steps: every must be a whole number of at least 1, got 2.5"),  # type: ignore
         (lambda: Steps(2, 0), "Steps: factor must be a finite number > 0, got 0"),
         (lambda: Warmup(True), "Warmup: steps must be a whole number of at least 1, got True"),
-        (lambda: Warmup(3, 0.5), "Warmup: then must be a schedule or None, got 0.5"),  # type: ignore
+        (lambda: Warmup(3, 0.5), "Warmup: then must be one of unrender.schedules or None, got 0.5"),  # type: ignore
     ],
 )
 def test_bad_arguments_are_named(make, message):

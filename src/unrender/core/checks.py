@@ -9,12 +9,13 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, in_words, printable, reason_of
 
@@ -28,6 +29,8 @@ Fraction = Annotated[float, 0.0, 1.0, True]
 """A number in [0, 1)."""
 OpenFraction = Annotated[float, 0.0, 1.0]
 """A number in (0, 1)."""
+PositiveByKey = Annotated[Mapping[str, float], 0.0]
+"""{key of a parameter: a finite number > 0}."""
 Index = Annotated[int, 0]
 Count = Annotated[int, 1]
 Several = Annotated[int, 2]
@@ -59,7 +62,7 @@ def real(value: Any) -> float:
 
 def path(where: str, value: Any, what: str = "a folder") -> Path:
     """Return the path of a file or folder, else raise `InputError`. "" would be the current folder."""
-    if isinstance(value, (str, os.PathLike)) and value != "":
+    if isinstance(value, (str, os.PathLike)) and value != "" and "\0" not in os.fspath(value):
         return Path(value)
     raise InputError(f"{where}: expected {what}, got {in_words(value)}")
 
@@ -97,10 +100,29 @@ def choice(owner: str, name: str, value: Any, *choices: str) -> None:
         raise InputError(f"{owner}: {name} must be {words}, got {in_words(value)}{did_you_mean(value, choices)}")
 
 
+def by_key(owner: str, name: str, values: Any, above: float) -> None:
+    """Raise `InputError` unless `values` is {key of a parameter: finite number > `above`}."""
+    if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
+        raise InputError(f"{owner}: {name} must be numbers by key, {{key: number}}, got {in_words(values)}")
+    for key, value in values.items():
+        number(owner, f"{name} of {key}", value, above)
+
+
+def component(owner: str, name: str, value: Any, expected: str, *kinds: type) -> None:
+    """Raise `InputError` unless `value` is of one of these classes, or has the methods of the components of one of these protocols."""
+    protocols = [registry.kind_of_protocol(kind) for kind in kinds]
+    if not any(
+        isinstance(value, kind) if protocol is None else registry.implements(value, protocol)
+        for kind, protocol in zip(kinds, protocols, strict=True)
+    ):
+        raise InputError(f"{owner}: {name} must be {expected}, got {in_words(value)}")
+
+
 def fields(part: Any, owner: str = "") -> None:
     """Raise `InputError` unless each field of a dataclass instance fits its annotation.
 
-    Checked are the ranges above, `bool` and `Literal`, each also with `| None`. `owner` is the name in messages; "" is the class's.
+    Checked are the ranges above, `bool`, `Literal` and components, each also with `| None`. `owner` is the name in messages; "" is the
+    class's.
     Numbers of other types, such as NumPy's, become Python's: Mitsuba takes no others.
     """
     for name, check, limits, optional in _checked(type(part)):
@@ -139,8 +161,23 @@ def _checked(kind: type) -> list[tuple[str, Callable[..., Any], tuple[Any, ...],
         elif all(get_origin(each) is Literal for each in others):
             found.append((field.name, choice, limits, len(others) < len(kinds)))
         elif len(others) == 1 and get_origin(others[0]) is Annotated:
-            found.append((field.name, integer if limits[0] is int else number, limits[1:], len(kinds) > 1))
+            check = {int: integer, float: number}.get(limits[0], by_key)
+            found.append((field.name, check, limits[1:], len(kinds) > 1))
+        elif all(words := [_expected(each) for each in others]):
+            none = NoneType in kinds
+            expected = " or ".join([*words, "None"] if none else words)
+            found.append((field.name, component, (expected, *others), none))
     return found
+
+
+def _expected(annotation: Any) -> str:
+    """Return in words which components an annotation allows; "" if it is no component and no protocol of them with methods."""
+    kind = registry.KINDS.get(registry.kind_of_protocol(annotation) or "")
+    if kind is not None:
+        return f"one of {kind.package}" if kind.members else ""
+    name = getattr(annotation, "__name__", "")
+    known = registry.component_of(annotation)
+    return "" if known is None else f"{'an' if name[0] in 'AEIO' else 'a'} {name}"
 
 
 def encode_text(text: str, where: str) -> bytes:

@@ -74,8 +74,8 @@ KINDS: dict[str, Kind] = {
         _kind("preconditioner", "unrender.preconditioners", "unrender.preconditioners.base.Preconditioner", "check apply"),
         _kind("pixel sampler", "unrender.pixels", "unrender.pixels.base.PixelSampler", "init draw observe"),
         _kind("image estimator", "unrender.images", "unrender.images.base.ImageEstimator", "init estimate advance"),
-        _kind("estimator", "unrender.estimators", "unrender.estimators.base.Estimator", "init estimate"),
-        _kind("optimizer", "unrender.optimizers", "unrender.optimizers.base.Optimizer", "init update"),
+        _kind("estimator", "unrender.estimators", "unrender.estimators.base.Estimator", "provides init estimate"),
+        _kind("optimizer", "unrender.optimizers", "unrender.optimizers.base.Optimizer", "requires init update"),
         _kind("step transform", "unrender.optimizers.transforms", "unrender.optimizers.transforms.base.StepTransform"),
         _kind("method", "unrender.methods", "unrender.methods.base.Options", in_tables=False),
         _kind(
@@ -199,6 +199,12 @@ def kind_of_protocol(protocol: Any) -> str | None:
     return next((kind.name for kind in KINDS.values() if kind.protocol == path), None)
 
 
+def implements(value: Any, kind: str) -> bool:
+    """Return whether an object, no class, has the methods of the components of a kind."""
+    sets = () if isinstance(value, type) else KINDS[kind].members
+    return any(all(hasattr(value, member) for member in members) for members in sets)
+
+
 def state_modules() -> frozenset[str]:
     """Return the modules whose frozen dataclasses a checkpoint may restore: those of the registered components."""
     _load_entry_points()
@@ -256,7 +262,7 @@ def _explain_unknown_arguments(made_by: type) -> None:
 
 
 def _check_kind(kind: str) -> Kind:
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         hint = did_you_mean(str(kind), KINDS) or f"; there are {', '.join(KINDS)}"
         raise InputError(f"register: no kind {kind!r}{hint}")
     return KINDS[kind]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from unrender.core import arrays, checks, trees
-from unrender.core.checks import Positive, Several
+from unrender.core.checks import Positive, PositiveByKey, Several
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -151,7 +150,7 @@ class GaussNewton:
     width: Positive = 0.01
     tolerance: Positive = 2.0
     coarse: Positive | None = None
-    largest: Mapping[str, float] = field(default_factory=dict)
+    largest: PositiveByKey = field(default_factory=dict)
     noise_limit: Positive | None = None
     by_channel: bool = False
     remember: bool = False
@@ -161,8 +160,6 @@ class GaussNewton:
 
     def __post_init__(self):
         checks.fields(self)
-        for key, width in self.largest.items():
-            checks.number("GaussNewton", f"largest of {key}", width, above=0.0)
         if self.coarse is not None and self.coarse < self.shift:
             raise InputError(f"GaussNewton: coarse must be at least shift, {self.shift:g}, got {self.coarse:g}")
 

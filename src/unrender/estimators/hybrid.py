@@ -146,10 +146,6 @@ class HybridGradient:
             if isinstance(keys, str) or not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
                 raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {in_words(keys)}")
             object.__setattr__(self, name, tuple(keys))
-        if isinstance(self.path, type) or not hasattr(self.path, "provides"):
-            raise InputError(
-                f"HybridGradient: path must be an estimator, such as PathGradient(), got {in_words(self.path)}"
-            )
         if isinstance(self.path, (SmoothedDerivatives, HybridGradient)) or Gradient.name not in self.path.provides:
             raise InputError(
                 f"HybridGradient: path must be an estimator of path gradients, such as PathGradient(), got "

@@ -15,7 +15,6 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
 from unrender.estimators.emitter_selection import EmitterRequest
@@ -258,10 +257,8 @@ def draws_pixels(pixels: PixelSampler) -> bool:
 
 
 def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, adjoint_spp: int | None = None) -> None:
-    """Raise `InputError` for an invalid pixel sampler, for mini-batches or sample counts that the image estimator does not support, or for
-    fewer than `fewest` samples per pixel of any gradient of a step."""
-    if isinstance(pixels, type) or not isinstance(pixels, PixelSampler):
-        raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {in_words(pixels)}")
+    """Raise `InputError` for mini-batches or sample counts that the image estimator does not support, or for fewer than `fewest` samples
+    per pixel of any gradient of a step."""
     if not isinstance(pixels, All) and not image.pixelwise:
         raise InputError(f"{owner}: {type(image).__name__} needs full views; use pixels=unrender.pixels.All()")
     if isinstance(image, RecursiveControlVariate) and not draws_pixels(pixels):

@@ -196,8 +196,8 @@ class Denoised(WithoutSnapshot):
 
     def __post_init__(self):
         checks.fields(self)
-        if isinstance(self.inner, (type, Denoised)):
-            raise InputError(f"Denoised: inner must be an image estimator such as Plain(), got {in_words(self.inner)}")
+        if isinstance(self.inner, Denoised):
+            raise InputError("Denoised: inner must be another image estimator, such as Plain(), got a Denoised")
 
     @property
     def space(self) -> Space | None:

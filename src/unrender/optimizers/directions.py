@@ -73,8 +73,6 @@ def check_options(owner: str, options: DirectionOptions) -> None:
     check_rates(owner, options.learning_rate, options.schedule)
     if checks.number(owner, "step_scale", options.step_scale, above=0.0) > 1.0:
         raise InputError(f"{owner}: step_scale must be at most 1, got {in_words(options.step_scale)}")
-    if options.inner_optimizer is not None and not isinstance(options.inner_optimizer, Adam):
-        raise InputError(f"{owner}: inner_optimizer must be an Adam or None, got {in_words(options.inner_optimizer)}")
 
 
 def init_state(

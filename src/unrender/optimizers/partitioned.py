@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from unrender.core import trees
+from unrender.core import checks, trees
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import listed
@@ -65,6 +65,7 @@ class Partitioned:
     others: Optimizer = field(default_factory=Adam)
 
     def __post_init__(self):
+        checks.fields(self)
         object.__setattr__(self, "keys", checked_keys("Partitioned: keys", self.keys))
         if self.others.requires != Capabilities(Gradient):
             kind = type(self.others).__name__
@@ -163,7 +164,7 @@ class SuccessiveState:
 
 @register
 @dataclass(frozen=True)
-class Successive:
+class Successive(checks.Checked):
     """Steps of one optimizer for estimates without a block, and of another one for blocks of all parameters (`PathThenNewton`).
 
     Args:

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 from unrender.core import arrays, checks
-from unrender.core.checks import Fraction, NotNegative, Positive
+from unrender.core.checks import Fraction, NotNegative, Positive, PositiveByKey
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -126,6 +126,7 @@ class Chain(Recipe):
     schedule: Schedule | None = None
 
     def __post_init__(self):
+        checks.fields(self)
         check_rates("Chain", self.learning_rate, self.schedule)
         object.__setattr__(self, "transforms", checked_transforms("Chain: transforms", self.transforms))
 
@@ -292,7 +293,7 @@ class ScheduleFree(Recipe):
     wiener: bool = True
     reparameterised: tuple[str, ...] = ()
     uniform: tuple[str, ...] = ()
-    pulled: Mapping[str, float] = field(default_factory=dict)
+    pulled: PositiveByKey = field(default_factory=dict)
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
     def __post_init__(self):

@@ -15,7 +15,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import in_words
 from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
-from unrender.losses import L2
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.base import PixelSampler
 from unrender.pixels.uniform import All, Uniform
@@ -54,10 +53,6 @@ class Options:
     def __post_init__(self):
         owner = "Renderer"
         checks.fields(self, owner)
-        if isinstance(self.image, type) or not callable(getattr(self.image, "estimate", None)):
-            raise InputError(
-                f"{owner}: image must be one of unrender.images, such as Plain(), got {in_words(self.image)}"
-            )
         check_pixels(owner, self.pixels, self.image, self.spp)
         if isinstance(self.pixels, AdaptiveCounts):
             raise InputError(
@@ -134,4 +129,4 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
     ]
     name = Path(scene).stem if isinstance(scene, (str, Path)) else "scene"
     parameters = [Parameter(key) for key in options.keys]
-    return Problem(renderer, parameters, views, options.loss or L2(), options.max_depth, name=name)
+    return Problem(renderer, parameters, views, options.loss, options.max_depth, name=name)

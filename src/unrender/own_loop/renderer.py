@@ -111,7 +111,8 @@ class Renderer:
             raise InputError(
                 f"Renderer: expected different sensors, each with a reference if any has one, got {in_words(sensor)}"
             )
-        options = (image or Plain(), pixels or All(), spp, adjoint_spp, groups, coupled, sensors, single)
+        parts = Plain() if image is None else image, All() if pixels is None else pixels
+        options = (*parts, spp, adjoint_spp, groups, coupled, sensors, single)
         self._options = Options(names, *options, max_depth or longest_path(port), seed, targets, loss)
         self._port, self._scene = port, scene
         self._streams: dict[str, Stream] = {}

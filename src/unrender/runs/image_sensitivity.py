@@ -19,7 +19,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, selected_views, view_request
+from unrender.scene.render import as_tree, check_problem, selected_views, view_request
 from unrender.statistics.debiased import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
@@ -108,8 +108,7 @@ def sensitivity(
 def check_arguments(owner: str, problem: Any, values: Any, seconds: Any, seed: Any) -> None:
     """Raise `InputError` unless these are a problem, finite values of its unknowns or None, a number of seconds, which may be infinite,
     and a seed."""
-    if not isinstance(problem, Problem):
-        raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {in_words(problem)}")
+    check_problem(owner, problem)
     if isinstance(seconds, bool) or not isinstance(seconds, Real) or np.isnan(checks.real(seconds)):
         raise InputError(f"{owner}: seconds must be a number, got {in_words(seconds)}")
     check_seed(f"{owner}: seed", seed)

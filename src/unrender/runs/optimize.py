@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import checks, phases
+from unrender.core import checks, phases, registry
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
@@ -37,7 +37,7 @@ from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
 from unrender.scene import serialization
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree
+from unrender.scene.render import as_tree, check_problem
 
 
 @exclusive("optimize", long=True)
@@ -87,7 +87,7 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget is invalid; the run folder is in use, cannot
             be created, or cannot be written at the end; another thread has a run in progress.
     """
-    _check_kinds(problem, callbacks)
+    _check_kinds(problem, callbacks, annotations, progress)
     plan = resolve(problem, estimator, optimizer)
     check(plan.estimator, plan.optimizer, steps, seconds)
     if checkpoint_every is not None:
@@ -103,11 +103,13 @@ def optimize(
         return descend(run)
 
 
-def _check_kinds(problem: Any, callbacks: Any) -> None:
-    if not isinstance(problem, Problem):
-        raise InputError(f"optimize: expected a Problem, such as that of Problem.from_file, got {_shown(problem)}")
+def _check_kinds(problem: Any, callbacks: Any, annotations: Any, progress: Any) -> None:
+    check_problem("optimize", problem)
     if not isinstance(callbacks, Sequence) or not all(isinstance(each, Callback) for each in callbacks):
         raise InputError(f"optimize: callbacks: expected a list of Callback objects, got {in_words(callbacks)}")
+    checks.optional("optimize: annotations", annotations, RunAnnotations, "a RunAnnotations")
+    if progress is not None:
+        checks.flag("optimize", "progress", progress)
 
 
 @contextmanager
@@ -191,6 +193,7 @@ def estimate(
             inside by 1e-4 of the range: no path has a gradient with respect to a black reflectance, or to a lobe of probability 0.
         seed: seed of the random numbers.
     """
+    check_problem("estimate", problem)
     seed, estimator = check_seed("estimate: seed", seed), resolve_estimator(problem, estimator, "estimate")
     problem.executor.check(estimator)
     point = off_ends(as_tree(problem, parameters), problem.renderer.parameters())
@@ -235,7 +238,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
         raise InputError(
             "optimize: give an optimizer, such as unrender.optimizers.Adam(learning_rate=0.01), or a method's name in place of both"
         )
-    if not _is_component(optimizer, "requires", "init", "update"):
+    if not registry.implements(optimizer, "optimizer"):
         raise InputError(f"optimize: optimizer: {_instead_of_optimizer(optimizer)}")
     return Plan(problem, chosen, optimizer)
 
@@ -244,19 +247,13 @@ def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize")
     """Return an estimator, from itself or a method's name. Raises `InputError` for anything else."""
     if isinstance(estimator, str):
         return method(estimator).plan(problem).estimator
-    if not _is_component(estimator, "provides", "init", "estimate"):
+    if not registry.implements(estimator, "estimator"):
         names = ", ".join(methods())
         raise InputError(
             f"{owner}: expected an estimator, such as unrender.PathGradient(spp=4), or the name of a method ({names}), "
             f"got {_shown(estimator)}"
         )
     return estimator
-
-
-def _is_component(value: Any, *members: str) -> bool:
-    return not isinstance(value, type) and all(
-        callable(getattr(type(value), m, None)) or hasattr(value, m) for m in members
-    )
 
 
 def _instead_of_optimizer(value: Any) -> str:

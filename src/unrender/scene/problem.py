@@ -127,6 +127,7 @@ class Problem(ViewLosses):
     ):
         check_max_depth(max_depth)
         checks.optional("name", name, str, "text")
+        checks.flag("Problem", "partial", partial)
         checks.optional("truth", truth, Mapping, "values by key of the parameters")
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
@@ -138,7 +139,6 @@ class Problem(ViewLosses):
         if not partial:
             check_determined(original_views, located, renderer, list(unknowns))
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
-        unknown_notices = [line for unknown in unknowns.values() for line in unknown.notices]
         vars(self).update(
             renderer=renderer,
             unknowns=unknowns,
@@ -150,7 +150,7 @@ class Problem(ViewLosses):
             origin={"scene": str(path.resolve())} if path and is_storable(renderer, original_views) else {},
             notices=[
                 *renderer_notices(renderer),
-                *unknown_notices,
+                *(line for unknown in unknowns.values() for line in unknown.notices),
                 *axis_notices(unknowns, renderer.parameters()),
                 *known_angles(original_views, renderer.parameters()),
                 *view_notices,

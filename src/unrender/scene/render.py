@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,7 @@ def render(
     Raises:
         InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes, or are not finite.
     """
+    check_problem("render", problem)
     spp = checks.integer("render", "spp", spp, at_least=1)
     seed, view = check_seed("render: seed", seed), checks.integer("render", "view", view, at_least=0)
     if view >= len(problem.views):
@@ -104,6 +106,7 @@ def render_pair(
     Returns:
         float32 (H, W, 3) of the current state, and the same of the previous state.
     """
+    check_problem("render_pair", problem)
     spp, seed = checks.integer("render_pair", "spp", spp, at_least=1), check_seed("render_pair: seed", seed)
     points = as_tree(problem, current), as_tree(problem, previous)
     session = problem.renderer.prepare(list(points[0]), "path")
@@ -113,6 +116,13 @@ def render_pair(
     if previous_image is None:
         raise UnrenderError("render_pair: the renderer returned only one of two images")
     return arrays.numpy(current_image[0]), arrays.numpy(previous_image[0])
+
+
+def check_problem(owner: str, problem: Any) -> None:
+    """Raise `InputError` for anything but a `Problem`."""
+    if not isinstance(problem, Problem):
+        words = f"the class {problem.__name__}" if isinstance(problem, type) else in_words(problem)
+        raise InputError(f"{owner}: expected a Problem, such as that of Problem.from_file, got {words}")
 
 
 def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:

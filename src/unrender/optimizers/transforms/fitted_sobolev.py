@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
@@ -286,6 +286,7 @@ class FittedSobolev(StepTransform):
     )
 
     def __post_init__(self):
+        checks.fields(self)
         keys = checked_keys("FittedSobolev: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.checks import PositiveByKey
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -184,11 +185,10 @@ class PullToStart(StepTransform):
         weights: {key: c}, > 0; other parameters are not pulled.
     """
 
-    weights: Mapping[str, float] = field(default_factory=dict)
+    weights: PositiveByKey = field(default_factory=dict)
 
     def __post_init__(self):
-        for key, weight in self.weights.items():
-            checks.number("PullToStart", f"weight of {key}", weight, above=0.0)
+        checks.fields(self)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Start:
         return Start({key: parameters[key] for key in self.weights})
