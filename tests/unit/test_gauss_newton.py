@@ -24,8 +24,9 @@ from unrender.estimators.capabilities import (
     ScoreCovariance,
     Smoothing,
 )
-from unrender.optimizers import AveragedNewton, averaged_newton
+from unrender.optimizers import AveragedNewton, Partitioned, Successive, averaged_newton
 from unrender.optimizers.newton import trust_region_step
+from unrender.optimizers.partitioned import PartitionedState, SuccessiveState
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
 from unrender.runs.folder.state import not_finite, pack
@@ -313,11 +314,17 @@ def test_only_numbers_that_the_trust_region_holds_away_from_the_minimum_have_no_
     away = {"x": minimum[:2] + np.array([errors * known["x"][0], 0.0]), "y": minimum[2:]}
     held = replace(state, lengths=np.ones(3), radii=np.full(3, radius))
     assert "".join(optimizer.standard_errors(held, away)) == told
-    assert optimizer.is_short(held, away) is ("x" not in told)
+    unsettled = {"x", "y"} - set(told)
+    assert optimizer.unsettled(held, away) == unsettled
+    assert optimizer.unsettled(replace(held, scores=None), away) == unsettled  # as in a block, which states no errors
+    block, after = Partitioned(("x", "y"), optimizer), Successive(then=optimizer)
+    assert block.unsettled(PartitionedState(held, None), {"map": np.zeros(9), **away}) == unsettled
+    assert after.unsettled(SuccessiveState(None, held, changed=True), away) == unsettled
+    assert not after.unsettled(SuccessiveState(None, held), away)
     # Weights that change with the noise leave few models, and steps at noisy references that are shorter than the errors.
     few, error = replace(state, counts=np.ones(3)), np.concatenate([known["x"], known["y"]])
-    assert not optimizer.is_short(replace(few, step=0.5 * error), tree)
-    assert optimizer.is_short(replace(few, step=2.0 * error), tree)
+    assert not optimizer.unsettled(replace(few, step=0.5 * error), tree)
+    assert optimizer.unsettled(replace(few, step=2.0 * error), tree) == {"x", "y"}
 
 
 @pytest.mark.slow

@@ -220,8 +220,9 @@ def block(**options: Any) -> ur.estimators.HybridGradient:
     return ur.estimators.HybridGradient(ur.PathGradient(spp=2), ur.GaussNewton(8, 4), **options)
 
 
-def solver() -> ur.optimizers.Optimizer:
-    return ur.optimizers.Partitioned(("pose",), ur.optimizers.AveragedNewton(), ur.optimizers.Adam(0.02))
+def solver(radius: float = 2.0) -> ur.optimizers.Optimizer:
+    newton = ur.optimizers.AveragedNewton(trust_radius=radius)
+    return ur.optimizers.Partitioned(("pose",), newton, ur.optimizers.Adam(0.02))
 
 
 @pytest.mark.slow
@@ -248,6 +249,14 @@ def test_a_block_of_numbers_is_solved_beside_a_texture(tmp_path: Path) -> None:
     resumed = ur.resume(tmp_path / "run", asked, steps=80)
     for key in TRUTH:
         np.testing.assert_array_equal(resumed.parameters[key], whole.parameters[key])
+
+
+@pytest.mark.parametrize("radius", [2.0, 0.01])
+def test_a_block_on_its_way_has_too_few_steps_to_judge(radius: float) -> None:
+    """It has no standard error that could tell, and ended as finished without a word."""
+    found = ur.optimize(problem(), block(), solver(radius), steps=12)
+    line = "12 steps are too few to judge whether pose converged: give more steps"
+    assert found.warnings == [line] * (radius < 1.0)
 
 
 def test_a_block_is_the_estimate_of_the_numbers_alone() -> None:

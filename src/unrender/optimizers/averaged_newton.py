@@ -230,22 +230,24 @@ class AveragedNewton:
         no `ScoreCovariance`. Parameters with fewer than 8 effective models, with models without noise, or still on the way to A⁻¹ b in a
         trust region that limits their steps, are omitted.
         """
+        if state.scores is None:
+            return {}
         errors, counts = (trees.parts(x[None], parameters) for x in self._errors(state, parameters))
         return {key: x[0] for key, x in errors.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
 
-    def is_short(self, state: AveragedNewtonState, parameters: Tree) -> bool:
-        """Return whether means have too few models for standard errors, after steps that are longer than these or that a region cuts."""
+    def unsettled(self, state: AveragedNewtonState, parameters: Tree) -> frozenset[str]:
+        """Return the parameters whose means have too few models for standard errors, after steps that are longer than these or that a
+        region cuts."""
         # Weights by noise change from step to step. At noisy references they leave few models, too, but short steps.
         errors, counts = self._errors(state, parameters)
         long = np.abs(state.step) > np.where(np.isfinite(errors), errors, 0.0)
-        return bool(((counts < _FEWEST_MODELS) & ((counts == 0.0) | long)).any())
+        short = (counts < _FEWEST_MODELS) & ((counts == 0.0) | long)
+        return frozenset(key for key, x in trees.parts(short[None], parameters).items() if x.any())
 
     def _errors(self, state: AveragedNewtonState, parameters: Tree) -> tuple[np.ndarray, np.ndarray]:
-        """Return the standard errors of A⁻¹ b, 0 if they are unknown, and the effective number of models, (n,) each. That is 0 for blocks
-        that the trust region holds more than a standard error away from A⁻¹ b."""
+        """Return the standard errors of A⁻¹ b, without the references' noise if that is unknown, and the effective number of models, (n,)
+        each. The number is 0 for blocks that the trust region holds more than a standard error away from A⁻¹ b."""
         known = state.matrix.any(axis=1)  # the others are in no model
-        if state.scores is None or not known.any():
-            return np.zeros(known.size), np.full(known.size, np.inf)
         x, errors, counts = trees.ravel(parameters), np.full(known.size, np.inf), np.where(known, state.counts, np.inf)
         held = (state.radii > 0.0) & (state.lengths >= _USED * state.radii)
         for block in _blocks(state.matrix != 0.0):
@@ -255,7 +257,7 @@ class AveragedNewton:
             scales, eigenvalues, directions = scaled_eigh(state.matrix[both])
             weak = eigenvalues <= self.damping * eigenvalues.max()
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / scales
-            middle = state.scatter[both] + positive_part(state.scores[both])
+            middle = state.scatter[both] + (0.0 if state.scores is None else positive_part(state.scores[both]))
             error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))
             errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.inf, error)
             away = np.abs(inverse @ (state.matrix[both] @ x[block] - state.target[block]))

@@ -63,6 +63,15 @@ def averaged_by(optimizer: Optimizer, keys: Iterable[str], state: Any = None) ->
 
 
 @runtime_checkable
+class Settling(Protocol):
+    """An optimizer that knows whether its parameters still move by more than noise."""
+
+    def unsettled(self, state: Any, parameters: Tree) -> frozenset[str]:
+        """Return the parameters that do."""
+        ...
+
+
+@runtime_checkable
 class Choosing(Protocol):
     """An optimizer that adapts some of its settings."""
 

@@ -22,7 +22,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
 )
 from unrender.optimizers.averaged_newton import AveragedNewton
-from unrender.optimizers.base import Choosing, Optimizer, averaged_by
+from unrender.optimizers.base import Choosing, Optimizer, Settling, averaged_by
 from unrender.optimizers.recipes import Adam, ScheduleFree
 from unrender.optimizers.transforms.base import checked_keys
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
@@ -127,6 +127,11 @@ class Partitioned:
             self.others, all_keys.difference(self.keys)
         )
 
+    def unsettled(self, state: PartitionedState, parameters: Tree) -> frozenset[str]:
+        """Return those of both optimizers."""
+        both = zip((self.optimizer, self.others), (state.own, state.others), self._parts(parameters), strict=True)
+        return frozenset().union(*(part.unsettled(*of) for part, *of in both if isinstance(part, Settling)))
+
     def choices(self, state: PartitionedState) -> tuple[str, ...]:
         """Return the choices of both optimizers, one line each."""
         both = ((self.optimizer, state.own), (self.others, state.others))
@@ -197,6 +202,10 @@ class Successive(checks.Checked):
     def standard_errors(self, state: SuccessiveState, parameters: Tree) -> Tree:
         """Return the standard errors of the second optimizer; {} before its first step."""
         return self.then.standard_errors(state.then, parameters) if state.changed else {}
+
+    def unsettled(self, state: SuccessiveState, parameters: Tree) -> frozenset[str]:
+        """Return those of the second optimizer, after its first step."""
+        return self.then.unsettled(state.then, parameters) if state.changed else frozenset()
 
     def choices(self, state: SuccessiveState) -> tuple[str, ...]:
         """Return the choices of the first optimizer, one line each."""

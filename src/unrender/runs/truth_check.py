@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
@@ -40,14 +41,14 @@ def has_few_steps(steps: int, optimizer: Optimizer) -> bool:
     return steps < (FEW_NEWTON_STEPS if isinstance(optimizer, AveragedNewton) else FEW_STEPS)
 
 
-def with_few_steps(problem: Problem, result: Result, short: bool = False) -> Result:
-    """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them. `short` says
-    that they are few whatever their number."""
-    unknown = [key for key in problem.unknowns if key not in result.standard_error]
+def with_few_steps(problem: Problem, result: Result, unsettled: AbstractSet[str] = frozenset()) -> Result:
+    """Return the result with a line that so few steps cannot be judged, unless another line or standard errors judge them. For the
+    `unsettled` unknowns they are few whatever their number."""
+    short = 0 < result.steps < FEW_NEWTON_STEPS
+    unknown = [key for key in problem.unknowns if key not in result.standard_error and (short or key in unsettled)]
     lines = (*result.warnings, *result.undetermined)
     advised = any(x in line for x in ("more steps", "more seconds", "of at least", "allows about") for line in lines)
-    short = result.steps > 0 and (short or result.steps < FEW_NEWTON_STEPS)
-    if result.status != "finished" or advised or not unknown or not short:
+    if result.status != "finished" or advised or not unknown:
         return result
     steps = "1 step is" if result.steps == 1 else f"{result.steps} steps are"
     line = f"{steps} too few to judge whether {listed(unknown)} converged: give more steps"

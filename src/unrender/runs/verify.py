@@ -13,7 +13,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
-from unrender.optimizers.averaged_newton import AveragedNewton
+from unrender.optimizers.base import Settling
 from unrender.runs import callbacks
 from unrender.runs.budget import seconds_of_steps
 from unrender.runs.callbacks import Callback
@@ -126,9 +126,9 @@ class Verify(Callback):
         with phases.phase(callbacks.VERIFYING), timing.counting(run.seconds is None):
             result = normalised(run.problem, self._verified(run, result))
         if run.folder is None:  # a folder has more tests
-            newton, of = run.optimizer, run.problem.coordinates.of
-            short = isinstance(newton, AveragedNewton) and newton.is_short(run.state.optimizer, of(run.parameters))
-            result = with_few_steps(run.problem, result, short)
+            of, solver = run.problem.coordinates.of(run.parameters), run.optimizer
+            unsettled = solver.unsettled(run.state.optimizer, of) if isinstance(solver, Settling) else frozenset()
+            result = with_few_steps(run.problem, result, unsettled)
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:
