@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+import unrender as ur
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
-SAID = "Mitsuba's path integrator squares the opacity"
+SAID = "Mitsuba's path integrator renders masks with nothing behind them too dark"
 KEY = "sheet.bsdf.opacity.value"
 
 
@@ -57,6 +59,26 @@ def test_a_sheet_reflects_in_proportion_to_its_opacity() -> None:
     assert float(image.mean()) == pytest.approx(0.6 * whole, rel=2e-3)
     assert theirs(0.6, "prb") == pytest.approx(0.6 * whole, rel=2e-3)
     assert theirs(0.6) == pytest.approx(0.36 * whole, rel=2e-3)
+
+
+def test_a_mask_before_an_environment_has_no_notice_and_is_no_darker() -> None:
+    """Only paths that leave the scene lose their light."""
+    described = scene(0.6) | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}}
+    path, prb = (
+        float(np.mean(np.array(mi.render(mi.load_dict(described), integrator=mi.load_dict({"type": kind}), spp=512))))
+        for kind in ("path", "prb")
+    )
+    assert path == pytest.approx(prb, rel=2e-3)
+    assert not any(notice.startswith(SAID) for notice in MitsubaRenderer(described, 2).notices)
+    described["integrator"]["hide_emitters"] = True
+    assert any(notice.startswith(SAID) for notice in MitsubaRenderer(described, 2).notices)
+
+
+def test_an_exported_mask_is_as_bright_in_plain_mitsuba(tmp_path: Path) -> None:
+    problem = ur.Problem(scene(0.6), [ur.Parameter(KEY)], [ur.View(np.zeros((4, 4, 3)))])
+    done = ur.app.export((problem, {KEY: np.array(0.6)}), tmp_path / "out")
+    image = np.mean(np.array(mi.render(mi.load_file(str(done.scene)), spp=512)))
+    assert float(image) == pytest.approx(0.6 * theirs(1.0), rel=2e-3)
 
 
 @pytest.mark.parametrize(

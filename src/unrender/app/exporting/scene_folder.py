@@ -260,7 +260,10 @@ def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
 
 def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: int, spp: int) -> None:
     """Set the rendering of the pictures of the run: the same path depth, independent samples, the reconstruction filters of the films."""
-    integrator = graph.child(0, mi.ObjectType.Integrator, "volpath" if renderer.pair.volumetric else "path")
+    masked = any(graph.nodes[index].props.plugin_name() == "mask" for index in graph.used())
+    # `path` drops light of masks, see `light_paths.mask_notices`, and `prb` does not support hide_emitters.
+    surfaces = "prb" if masked and not renderer.light_paths.hide_emitters else "path"
+    integrator = graph.child(0, mi.ObjectType.Integrator, "volpath" if renderer.pair.volumetric else surfaces)
     integrator["max_depth"], integrator["rr_depth"] = max_depth, renderer.light_paths.rr_depth
     if renderer.light_paths.hide_emitters:
         integrator["hide_emitters"] = True

@@ -96,12 +96,16 @@ def _notices(kind: str, own: int | None, requested: int | None, max_depth: int, 
 
 
 def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -> list[str]:
-    """Return one notice for a scene whose references Mitsuba's path integrator would render wrongly.
+    """Return one notice for a scene whose references Mitsuba's path integrator may render too dark.
 
-    In Mitsuba 3.9.1 `path` multiplies light sampled from emitters by the square of a mask's opacity; `prb`, `volpath` and `direct` do not.
+    In Mitsuba 3.9.1 `path` returns 0 for a path that passes through surfaces alone and leaves the scene, unless it shows an environment.
+    So light that a mask reflects is lost where such a path passes through it. `prb`, `volpath` and `direct` count it.
     """
     integrator = scene.integrator()
-    if integrator is not None and _kind(_light_transport(integrator)) != "PathIntegrator":
+    traced = integrator if integrator is None else _light_transport(integrator)
+    if traced is not None and _kind(traced) != "PathIntegrator":
+        return []
+    if scene.environment() is not None and not getattr(traced, "hide_emitters", False):
         return []
     masks = [mi.traverse(bsdf) for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     opacities = [np.array(mask[key]) for mask in masks for key in ("opacity.value", "opacity.data") if key in mask]
@@ -109,7 +113,10 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
     unknown = masks and any(key.split(".")[-2:][0] == "opacity" for key in keys)
     if not unknown and not any(((value > 0) & (value < 1)).any() for value in values):
         return []
-    return ["Mitsuba's path integrator squares the opacity of masks that emitters light; render references with prb"]
+    return [
+        "Mitsuba's path integrator renders masks with nothing behind them too dark: it drops the light that they reflect; render "
+        "references with prb"
+    ]
 
 
 def null_notices(scene: mi.Scene, bsdfs: Iterable[Any], volumetric: bool, max_depth: int) -> list[str]:
