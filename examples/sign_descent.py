@@ -2,8 +2,8 @@ from dataclasses import dataclass, replace
 
 import unrender as ur
 from unrender.core import arrays
-from unrender.optimizers.base import Optimizer, check_rates, rates_of, schedule_factor
-from unrender.schedules import Schedule
+from unrender.optimizers.base import Optimizer, check_rates, rates_of
+from unrender.schedules import Schedule, schedule_factor
 
 
 @dataclass(frozen=True)

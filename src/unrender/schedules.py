@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from unrender.core import checks
 from unrender.core.checks import Count, NotNegative, Positive
+from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import in_words
 
 __all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]
 
@@ -23,6 +25,18 @@ class Schedule(Protocol):
     def __call__(self, step: float) -> float:
         """Return the factor at `step`, which counts from 0."""
         ...
+
+
+def schedule_factor(owner: str, schedule: Schedule | None, step: float) -> float:
+    """Return the schedule's factor at `step`, 1 without a schedule. Raises `InputError` unless it is a finite number >= 0."""
+    value: Any = 1.0 if schedule is None else schedule(step)
+    try:
+        factor = math.nan if isinstance(value, (str, bytes)) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        factor = math.nan
+    if math.isfinite(factor) and factor >= 0.0:
+        return factor
+    raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {in_words(value)} at step {step:g}")
 
 
 @register(position=1)

@@ -54,6 +54,28 @@ def test_arrays_without_channels_have_one(tmp_path: Path) -> None:
     assert read_grid(write_grid(tmp_path / "a.vol", GRID[..., 0])).values.shape == (4, 3, 5, 1)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_integers_of_few_bits_are_refused_as_for_parameters(tmp_path: Path, kind: Any) -> None:
+    """A density of 200 stood for 0.78, and the same file as a parameter's value was refused."""
+    flags = (GRID > 0.5).astype(kind)
+    path = write_grid(tmp_path / "flags.npy", flags)
+    np.testing.assert_array_equal(read_grid(path).values, flags)
+    np.save(tmp_path / "levels.npy", 200 * flags)
+    words = r"expected linear values, got integers of 8 or 16 bits up to 200, .* to linear floating-point values$"
+    with pytest.raises(InputError, match=rf"levels\.npy: {words}"):
+        read_grid(tmp_path / "levels.npy")
+    with pytest.raises(InputError, match=rf"a\.vol: {words}"):
+        write_grid(tmp_path / "a.vol", 200 * flags)
+
+
+@pytest.mark.parametrize("path", [None, 3, [1], ""])
+def test_paths_of_grids_of_another_kind_are_one_line(path: Any) -> None:
+    with pytest.raises(InputError, match=r"^read_grid: expected a file, got "):
+        read_grid(path)
+    with pytest.raises(InputError, match=r"^write_grid: expected a file, got "):
+        write_grid(path, GRID)
+
+
 @pytest.mark.parametrize(
     ("name", "values", "box", "message"),
     [

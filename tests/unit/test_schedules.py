@@ -1,11 +1,13 @@
 """Schedules against closed forms."""
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 
 from unrender.core.errors import InputError
-from unrender.schedules import Constant, Cosine, Exponential, Inverse, InverseRoot, Steps, Warmup
+from unrender.schedules import Constant, Cosine, Exponential, Inverse, InverseRoot, Steps, Warmup, schedule_factor
 
 
 @pytest.mark.parametrize(
@@ -51,3 +53,18 @@ def test_bad_arguments_are_named(make, message):
     with pytest.raises(InputError) as caught:
         make()
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    "value", [10**400, -(10**400), math.nan, math.inf, -1.0, None, "0.5", b"1", [0.5], np.zeros(2), 1j]
+)
+def test_results_of_own_schedules_that_are_no_factor_are_one_line(value: Any) -> None:
+    with pytest.raises(InputError, match=r"^Adam: schedule must return a finite factor >= 0, got .* at step 3$"):
+        schedule_factor("Adam", lambda step: value, 3)
+
+
+@pytest.mark.parametrize("value", [0, 0.5, True, np.float32(0.5), np.int64(2), np.array(0.5)])
+def test_results_of_own_schedules_may_be_numbers_of_any_type(value: Any) -> None:
+    factor = schedule_factor("Adam", lambda step: value, 3)
+    assert type(factor) is float
+    assert factor == value

@@ -187,6 +187,21 @@ def test_sigma_follows_its_schedule() -> None:
     np.testing.assert_allclose(np.array(seen) / seen[0], [1, 0.5, 0.25, 0.2, 0.2], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("factor", "expected"),
+    [
+        (0.0, "schedule must stay above 0, got 0 at step 0; set its floor"),
+        (10**400, "schedule must return a finite factor >= 0, got an integer of 1329 bits at step 0"),
+        (None, "schedule must return a finite factor >= 0, got None at step 0"),
+    ],
+)
+def test_schedules_of_sigma_that_return_no_factor_are_one_line(factor: Any, expected: str) -> None:
+    asked = problem()
+    estimator = ur.SmoothedDerivatives(0.1, samples=8, schedule=lambda step: factor)
+    with pytest.raises(ur.InputError, match=f"^SmoothedDerivatives: {expected}$"):
+        estimator.estimate(asked, asked.initial(), estimator.init(asked, asked.initial()), Key(0))
+
+
 @pytest.mark.parametrize("joint", [True, False])
 def test_products_never_make_a_matrix(joint: bool) -> None:
     """A step of Newton-CG on 6000 numbers, whose Hessian would take 288 MB."""

@@ -245,3 +245,16 @@ def as_array(value: Any, owner: str, what: str = "an array of numbers") -> Any:
         ragged = "inhomogeneous" in str(error)
         got = "rows of different lengths" if ragged else f"{type(value).__name__}: {reason_of(error, 100)}"
         raise InputError(f"{owner}expected {what}, got {got}") from error
+
+
+_FILE = ", or give the picture's file as initial value"
+
+
+def refuse_encoded(values: Any, where: str = "", otherwise: str = _FILE) -> None:
+    """Raise `InputError` that begins with `where` for an array of several unsigned integers of 8 or 16 bits above 1, the levels of a
+    picture; `otherwise` ends its advice."""
+    if str(values.dtype) in ("uint8", "uint16") and values.size > 1 and values.max() > 1:
+        raise InputError(
+            f"{where}expected linear values, got integers of 8 or 16 bits up to {values.max():g}, as pictures are stored: convert them to "
+            f"linear floating-point values{otherwise}"
+        )

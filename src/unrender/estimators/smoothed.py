@@ -38,7 +38,7 @@ from unrender.estimators.smoothing.function import (
 from unrender.estimators.smoothing.sampling import SamplingOptions
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
-from unrender.schedules import Schedule
+from unrender.schedules import Schedule, schedule_factor
 
 _MAX_STORED = 4096  # maximum number of parameters for which a Hessian is stored between steps
 _DIRECTIONS = 1  # stream of random numbers for the directions of products; 0 is for the perturbations
@@ -196,7 +196,11 @@ class SmoothedDerivatives:
         """Return an estimate and the next state. `info`: "samples" (paths traced, including those of products), "images" per view at
         the parameters."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0), self.debiased)
-        factor = self.schedule(state.age) if self.schedule else 1.0
+        factor = schedule_factor("SmoothedDerivatives", self.schedule, state.age)
+        if factor == 0.0:
+            raise InputError(
+                f"SmoothedDerivatives: schedule must stay above 0, got 0 at step {state.age:g}; set its floor"
+            )
         smooth = PreconditionedPerturbations(problem, parameters)
         sigma = {
             name: factor * value for name, value in smooth.deviations(self._sigma_per_parameter(parameters)).items()

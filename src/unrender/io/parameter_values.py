@@ -100,7 +100,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         raise InputError(
             f"expected a number, a colour, a picture or grid file or an array, got {in_words(initial)}"
         ) from error
-    refuse_encoded(array)
+    checks.refuse_encoded(array)
     with np.errstate(over="ignore"):
         array = conversion.stored(array.astype(np.float32))
     if not np.isfinite(array).all():
@@ -119,15 +119,6 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         return np.array(np.broadcast_to(array.reshape(-1) if colour else array.reshape(()), shape)), ""
     got = f"an array of shape {array.shape}" if array.size != 1 else f"the number {array.item():g}"
     raise InputError(f"expected {_expected(shape, conversion)}, got {got}")
-
-
-def refuse_encoded(values: np.ndarray, where: str = "") -> None:
-    """Raise `InputError` that begins with `where` for several unsigned integers of 8 or 16 bits above 1: levels of a picture."""
-    if values.dtype in (np.uint8, np.uint16) and values.size > 1 and values.max() > 1:
-        raise InputError(
-            f"{where}expected linear values, got integers of 8 or 16 bits up to {values.max():g}, as pictures are stored: convert them to "
-            "linear floating-point values, or give the picture's file as initial value"
-        )
 
 
 def at_one_point(positions: np.ndarray) -> bool:

@@ -54,17 +54,17 @@ class Grid:
 def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) -> Grid:
     """Read the grid of a file.
 
-    Arrays (Z, Y, X) are grids of one channel. Integers are converted without scaling.
+    Arrays (Z, Y, X) are grids of one channel. Integers are not scaled: those of 8 or 16 bits above 1 are refused, as for parameters.
 
     Args:
         path: file of a kind in `READABLE`.
         check: function of the declared shape (Z, Y, X, C), called before memory is allocated; raises `InputError` for an unsuitable one.
 
     Raises:
-        InputError: one line that begins with the file: it is missing or malformed, or the grid has an unsupported shape, is too large, or
-            is not finite.
+        InputError: one line that begins with the file: it is missing or malformed, or the grid has an unsupported shape or type, is too
+            large, or is not finite.
     """
-    file = _existing(Path(path))
+    file = _existing(checks.path("read_grid", path, "a file"))
 
     def suits(shape: Shape) -> None:
         if len(shape) not in (3, 4) or 0 in shape:
@@ -75,8 +75,10 @@ def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) ->
 
     if file.suffix.lower() == ".vol":
         return _read_vol(file, suits)
+    stored = read_numpy(file, suits)
+    checks.refuse_encoded(stored, f"{file}: ", "")
     with np.errstate(over="ignore"):
-        array = read_numpy(file, suits).astype(np.float32)
+        array = stored.astype(np.float32)
     _check_finite(file, array)
     return Grid(array if array.ndim == 4 else array[..., None])
 
@@ -94,7 +96,7 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
     Raises:
         InputError: the values or the box are invalid, or the file cannot be written.
     """
-    file = Path(path)
+    file = checks.path("write_grid", path, "a file")
     ending = file.suffix.lower()
     if ending not in READABLE:
         raise InputError(f"{file}: unknown kind of grid, expected one of {', '.join(READABLE)}")
@@ -105,6 +107,7 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
         stream = mi.MemoryStream()
         values.write(stream)
         return files.write(file, stream.raw_buffer())
+    checks.refuse_encoded(checks.as_array(values, f"{file}: "), f"{file}: ", "")
     try:
         array = np.ascontiguousarray(values, np.float32)
     except (TypeError, ValueError, OverflowError) as error:

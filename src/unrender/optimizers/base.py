@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any, Protocol, runtime_checkable
@@ -12,7 +11,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.schedules import Schedule
 
 
 class Optimizer(Protocol):
@@ -112,11 +110,3 @@ def rates_of(
             raise InputError(f'{owner}: learning rate given for unknown parameter "{key}"{hint}')
         checks.number(owner, f'learning rate of "{key}"', rate, above=0.0)
     return {key: float(own.get(key, common)) for key in keys}
-
-
-def schedule_factor(owner: str, schedule: Schedule | None, step: int) -> float:
-    """Return the schedule's factor at `step`. Raises `InputError` if it is negative or not finite."""
-    value = 1.0 if schedule is None else float(schedule(step))
-    if not (math.isfinite(value) and value >= 0.0):
-        raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {in_words(value)} at step {step}")
-    return value

@@ -17,10 +17,10 @@ from unrender.core.text import in_words
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import AtBounds, Smoothing
-from unrender.optimizers.base import check_rates, rates_of, schedule_factor
+from unrender.optimizers.base import check_rates, rates_of
 from unrender.optimizers.recipes import Adam, ChainState
 from unrender.scene.upsampling import NotCarried, Upsampler
-from unrender.schedules import Schedule
+from unrender.schedules import Schedule, schedule_factor
 
 
 @dataclass(frozen=True)

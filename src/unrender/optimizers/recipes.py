@@ -17,7 +17,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
-from unrender.optimizers.base import check_rates, rates_of, schedule_factor
+from unrender.optimizers.base import check_rates, rates_of
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.averages import DecayingSum, GradientMean, ScheduleFreeAverage
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_keys, checked_transforms
@@ -27,7 +27,7 @@ from unrender.optimizers.transforms.scale import ScaleByDeviation, ScaleByRms
 from unrender.optimizers.transforms.shrinkage import PullToStart, WienerShrinkage
 from unrender.preconditioners.base import Preconditioner
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
-from unrender.schedules import Schedule
+from unrender.schedules import Schedule, schedule_factor
 
 S = TypeVar("S")
 

@@ -20,7 +20,6 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.io.parameter_values import refuse_encoded
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
 
@@ -343,7 +342,7 @@ def host(x: Any, owner: str) -> np.ndarray:
     values = checks.as_array(x, f"{owner}: ")
     if values.dtype.kind not in "fiu":
         raise InputError(f"{owner}: expected an array of numbers, got {type(x).__name__} of {values.dtype}")
-    refuse_encoded(values, f"{owner}: ")
+    checks.refuse_encoded(values, f"{owner}: ")
     return values if values.dtype == np.float64 else values.astype(np.float32)
 
 

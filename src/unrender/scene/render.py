@@ -13,7 +13,6 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key, check_seed
 from unrender.core.text import in_words
 from unrender.core.trees import Tree
-from unrender.io import parameter_values
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 
@@ -136,7 +135,7 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
     given = {key: checks.array_like(value, "fill it") for key, value in parameters.items()}
     for key, value in given.items():
-        parameter_values.refuse_encoded(checks.as_array(value, f"parameter {key}: "), f"parameter {key}: ")
+        checks.refuse_encoded(checks.as_array(value, f"parameter {key}: "), f"parameter {key}: ")
     parameters = problem.full({key: arrays.to_numpy(x, arrays.shape(point[key])) for key, x in given.items()})
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
