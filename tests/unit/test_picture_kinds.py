@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, PngImagePlugin
 
 import unrender
 from unrender.app.capture import pictures
 from unrender.core.errors import InputError
-from unrender.io import image_size, tiff_header
+from unrender.io import image_size, images, tiff_header
 from unrender.io.images import srgb_to_linear
 
 cv2 = pytest.importorskip("cv2", reason="photographs need OpenCV")
@@ -281,6 +281,31 @@ def test_every_orientation_of_exif_turns_pixels_upright(orientation: int) -> Non
     picture.getexif()[0x0112] = orientation
     upright = np.asarray(ImageOps.exif_transpose(picture))
     np.testing.assert_array_equal(pictures._turn(PIXELS, orientation), upright)
+
+
+@pytest.mark.parametrize("place", ["none", "before", "after", "text", "xmp"])
+def test_pixels_of_a_png_are_not_decoded_again_unless_it_may_have_exif(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """EXIF may follow the pixels, be hexadecimal text, or be in XMP alone."""
+    exif, texts, file = Image.Exif(), PngImagePlugin.PngInfo(), tmp_path / "a.png"
+    exif[0x0112] = 6
+    data = exif.tobytes()
+    if place == "text":
+        texts.add_text("Raw profile type exif", f"\nexif\n{len(data):8}\n{data.hex()}", zip=True)
+    if place == "xmp":
+        texts.add_itxt("XML:com.adobe.xmp", '<x:xmpmeta><rdf:Description tiff:Orientation="6"/></x:xmpmeta>')
+    Image.fromarray(PIXELS).save(file, pnginfo=texts, exif=exif if place == "before" else b"")
+    if place == "after":
+        chunk = b"eXIf" + data.removeprefix(b"Exif\0\0")
+        length, check = len(chunk) - 4, zlib.crc32(chunk)
+        written = file.read_bytes()
+        file.write_bytes(written[:-12] + struct.pack(">I", length) + chunk + struct.pack(">I", check) + written[-12:])
+    if place == "none":
+        monkeypatch.setattr(Image.Image, "load", lambda *_: pytest.fail("the pixels are decoded"))
+    assert [fault[:29] for fault in images.metadata(file, True)[0]] == ["its EXIF orientation is 6, wh"] * (
+        place != "none"
+    )
 
 
 def test_sixteen_bits_are_kept_whatever_a_file_is_called(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,9 +118,9 @@ def metadata(source: Any, linearised: bool) -> tuple[list[str], str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with bounded_files.open_regular(path) as file, Image.open(file, formats=["JPEG", "PNG"]) as picture:
-                if picture.format == "PNG":
-                    picture.load()  # EXIF may follow the pixels
-                srgb, turned = is_srgb(picture.info.get("icc_profile"), exif_of(picture)), orientation(picture)
+                # Pillow decodes the pixels of a PNG file before it looks for EXIF, which may follow them.
+                exif = exif_of(picture) if picture.format != "PNG" or _has_exif(path) else Image.Exif()
+                srgb, turned = is_srgb(picture.info.get("icc_profile"), exif), orientation(exif)
                 gamma = other_gamma(picture)
     except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
         return [], ""
@@ -173,9 +174,15 @@ def _is_srgb_profile(profile: bytes) -> bool:
     return np.abs(np.array(shown, np.int16) - np.array(colours.convert("RGB"))).max() <= _MOST_LEVELS
 
 
-def orientation(picture: Image.Image) -> int:
+def _has_exif(path: Path) -> bool:
+    """Return whether a PNG file may have what Pillow's `getexif` reads."""
+    with bounded_files.open_regular(path) as file:
+        return re.search(rb"eXIf|Raw profile type|adobe\.xmp", file.read()) is not None
+
+
+def orientation(exif: Image.Exif) -> int:
     """Return EXIF's orientation, 1 if it is absent or unreadable."""
-    value = exif_of(picture).get(_ORIENTATION, 1)
+    value = exif.get(_ORIENTATION, 1)
     return value if isinstance(value, int) else 1
 
 

@@ -70,7 +70,7 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
             if picture.format == "PNG":
                 with _errors_of_pillow(path):
                     picture.load()  # EXIF may follow the pixels
-            return picture.width, picture.height, images.orientation(picture)
+            return picture.width, picture.height, images.orientation(images.exif_of(picture))
     if header.kind == "TIFF":
         width, height, _ = header.sizes[0]
         return width, height, header.orientation
