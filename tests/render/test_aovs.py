@@ -214,6 +214,18 @@ def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.03)
 
 
+def test_a_camera_is_recovered_from_its_depths() -> None:
+    """Depths are another sensor of the same camera: their derivative was left out, so the camera stayed at its start."""
+    key, blank = "camera.translation.x", ur.View(np.zeros((SIZE, SIZE)), aov="depth")
+    made = problem([blank], (key,))
+    seen = np.asarray(ur.render(made, {key: np.float32(0.3)}, spp=256))[..., :1]
+    made = made.replaced(views=[replace(blank, reference=seen)])
+    result = ur.optimize(made, ur.GaussNewton(16, derivative_spp=8), ur.optimizers.AveragedNewton(), steps=15)
+    assert result.parameters[key] == pytest.approx(0.3, abs=0.03)
+    both = made.replaced(views=[ur.View(np.zeros((SIZE, SIZE, 3))), made.original_views[0]])
+    assert [x.renderer.parameters()[key].sensor for x in (made, both)] == [made.views[0].sensor, None]
+
+
 @pytest.mark.slow
 def test_a_mesh_may_move_beside_opacity_masks_where_no_view_has_colour() -> None:
     """It was refused: the renderer of colour, which no view uses, has no such derivative."""

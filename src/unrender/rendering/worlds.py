@@ -145,7 +145,7 @@ class WorldsRenderer(RendererWrapper):
                     perturbable=info.perturbable and other.perturbable,
                     reason=info.reason or other.reason,
                 )
-            combined[key] = info if info.sensor is None else replace(info, sensor=self._only(info.sensor))
+            combined[key] = info if info.sensor is None else replace(info, sensor=self._only(key))
         return combined
 
     def resolutions(self) -> list[tuple[int, int]]:
@@ -208,13 +208,18 @@ class WorldsRenderer(RendererWrapper):
         worlds = [replace(world, renderer=change(world.renderer)) for world in self.worlds]
         return WorldsRenderer(change(self.inner), worlds, self.bare)
 
-    def _only(self, sensor: int) -> int | None:
-        """Return the only sensor that renders with a sensor of the first scene; None where several do."""
-        inner = [False] * self._count + [world.renderer is self.inner for world in self.worlds]
-        candidates = [
-            n for n in range(len(self._sensor)) if self._sensor[n] == sensor and (n < self._count or inner[n])
+    def _only(self, key: str) -> int | None:
+        """Return the only sensor that depends on a sensor's parameter; None where several do.
+
+        A sensor of another scene, or of an AOV, has the parameter too if its renderer has one of this key.
+        """
+        of = [state.renderer.parameters().get(key) for state in self.states]
+        shown = [
+            n
+            for n in range(0 if self.bare else self._count, len(self._sensor))
+            if (info := of[self._state[n]]) is not None and info.sensor in (None, self._sensor[n])
         ]
-        return candidates[0] if len(candidates) == 1 else None
+        return shown[0] if len(shown) == 1 else None
 
     def _part(self, request: SampleRequest, numbers: np.ndarray, chosen: np.ndarray) -> SampleRequest:
         pixels, positions = request.pixels, request.positions
