@@ -23,6 +23,8 @@ _EXPLAINED, _OF_MESH, _TO_EXPLAIN = 0.2, 0.9, 0.02
 its silhouette fits; and smallest difference relative to the picture, with the initial values, of which they must."""
 _BRIGHT, _BUT, _OTHER = 0.05, ", but for its brightest pixels", ", or something that is not among the unknowns is wrong"
 """Share of the brightest pixels, without which a texture or grid is judged once more; words about these, and about another cause."""
+_HIDDEN = "noise hides its cause"
+"""Words of the line about a difference that may be noise or may not."""
 _BLOCKS, _CHANCE, _APART = (1, 8, 1 << 30), 7.0, 3
 """Number of blocks of equal sign along each axis, for each tested change of a map; number of standard errors that chance does not reach,
 also where the film's filter makes noise of adjacent pixels alike; distance of compared pixels, at which no filter does."""
@@ -43,8 +45,8 @@ def no_better_maps(
 
     It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where the pictures with the
     initial values agree with the references, there is nothing to explain. No map explains noise of the references, see `_may_explain`. Few
-    random changes of a mesh change the pictures as its residual does, so that of a mesh must not be noise by `misfit`, or the line says
-    that noise hides its cause.
+    random changes of a mesh change the pictures as its residual does, so that of a mesh must not be noise by `misfit`. If noise may be all
+    that is left, the line says that it hides the cause.
 
     Args:
         keys: keys of textures, grids and vertices.
@@ -62,8 +64,8 @@ def no_better_maps(
             Residuals.of(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
         )
         line = _line(problem, result, key, start, end, pictures)
-        if not line and key not in problem.faces:
-            line = _line(problem, result, key, *_dimmer(start, end), pictures, _BUT)
+        if key not in problem.faces and (not line or _HIDDEN in line):
+            line = _line(problem, result, key, *_dimmer(start, end), pictures, _BUT) or line
         lines += filter(None, [line])
     return lines
 
@@ -91,9 +93,11 @@ def _line(
             f"{key}: the final picture is {closer} closer to the references than with its initial values{but}: they hardly determine it, "
             f"or it needs more steps, or fewer {'vertices' if is_mesh else 'elements'}{_OTHER * bool(but)}"
         )
-    return is_mesh * (
+    if but:
+        return ""
+    return (
         f"{key}: whether the pictures determine it is not known: the final picture's difference from the references is "
-        f"{remains:.0%} of that with its initial values, and noise hides its cause; use more steps, or more samples per pixel"
+        f"{remains:.0%} of that with its initial values, and {_HIDDEN}; use more steps, or more samples per pixel"
     )
 
 
