@@ -45,8 +45,6 @@ endef
 # What does best for the usual loop on this problem in 20 seconds. Ours has no option.
 TUNED := --set stock.spp=16 --set stock.learning_rate=0.05
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
-# Where the environment forbids byte code, every test process and every command that a test starts would compile all that it imports.
-export PYTHONDONTWRITEBYTECODE :=
 
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile

@@ -28,6 +28,9 @@ SCENES = [0]
 
 # Threads of BLAS that wait for one another beside other processes take a hundred times the processor time of a small system of equations.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Where the environment forbids byte code, every test process and every command that a test starts would compile all that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 # Every process of the run shares one folder, the commands that tests start too. `make clean` empties it.
 os.environ.setdefault(KERNELS, str(HERE.parent / ".pytest_cache" / "kernels"))
 os.makedirs(os.environ[KERNELS], exist_ok=True)
