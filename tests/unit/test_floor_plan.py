@@ -45,15 +45,11 @@ def modules() -> dict[str, Path]:
 
 
 @cache
-def parsed(source: str) -> ast.Module:
-    """Each source once for all tests."""
-    return ast.parse(source)
-
-
-@cache
-def names_imported(source: str) -> list[tuple[str, int, bool]]:
-    """(name below `unrender`, line, whether it is imported when the file is: neither in a function nor for type checkers alone)."""
+def facts(source: str) -> tuple[list[tuple[str, int, bool]], dict[str, int]]:
+    """Imports of a module, as (name below `unrender`, line, whether it is imported when the file is: neither in a function nor for type
+    checkers alone), and {function: number of lines}. The tree is not kept: its many nodes would slow down every garbage collection."""
     found: list[tuple[str, int, bool]] = []
+    functions: dict[str, int] = {}
 
     def visit(node: ast.AST, now: bool) -> None:
         names: list[str] = []
@@ -63,6 +59,8 @@ def names_imported(source: str) -> list[tuple[str, int, bool]]:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         own = (name.removeprefix("unrender.") for name in names if name.startswith("unrender."))
         found.extend((name, getattr(node, "lineno", 0), now) for name in own)
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            functions[node.name] = max((node.end_lineno or 0) - node.lineno + 1, functions.get(node.name, 0))
         for_types = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         now = now and not for_types and not isinstance(node, ast.FunctionDef)
         # Only statements: an expression imports nothing.
@@ -70,13 +68,14 @@ def names_imported(source: str) -> list[tuple[str, int, bool]]:
             for child in getattr(node, block, ()):
                 visit(child, now)
 
-    visit(parsed(source), True)
-    return found
+    for statement in ast.parse(source).body:
+        visit(statement, True)
+    return found, functions
 
 
 def imports(source: str, known: Iterable[str]) -> Iterator[tuple[str, int, bool]]:
-    """`names_imported` with the modules that the names are of, among those known."""
-    for name, line, now in names_imported(source):
+    """The imports of `facts` with the modules that the names are of, among those known."""
+    for name, line, now in facts(source)[0]:
         yield name if name in known else name.rpartition(".")[0], line, now
 
 
@@ -142,9 +141,7 @@ def test_files_and_functions_stay_small(module: str) -> None:
     text = modules()[module].read_text()
     assert len(text.splitlines()) <= LONGEST_FILE
     assert not any(line.startswith("# pyright:") for line in text.splitlines()), "pyright is silenced for a whole file"
-    functions = [x for x in ast.walk(parsed(text)) if isinstance(x, (ast.FunctionDef, ast.AsyncFunctionDef))]
-    long = {x.name: x.end_lineno - x.lineno + 1 for x in functions if x.end_lineno is not None}
-    assert {name: lines for name, lines in long.items() if lines > LONGEST_FUNCTION} == {}
+    assert {name: lines for name, lines in facts(text)[1].items() if lines > LONGEST_FUNCTION} == {}
 
 
 def slivers(sources: dict[str, str]) -> set[str]:
