@@ -113,15 +113,10 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
     )
 
 
-def is_logarithmic(values: np.ndarray) -> bool:
-    """Return whether these values, all finite, suit a logarithmic axis: they are positive and span at least a factor of four."""
-    return bool(values.size and values.min() > 0 and values.max() / _LOGARITHMIC_FROM >= values.min())
-
-
 def _vertical(lines: Sequence[Line]) -> Axis:
     parts = [line.y for line in lines] + [b for line in lines for b in (line.low, line.high) if b is not None]
     values, middle = _drawable(parts), _drawable([line.y for line in lines])
-    if is_logarithmic(middle):
+    if middle.size and middle.min() > 0 and middle.max() / _LOGARITHMIC_FROM >= middle.min():
         # A band that touches zero must not stretch the logarithmic axis indefinitely.
         low, high = max(values[values > 0].min(), middle.min() / 10), values.max()
         margin = 10.0 ** (0.04 * (math.log10(high) - math.log10(low)))

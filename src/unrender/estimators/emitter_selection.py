@@ -64,7 +64,6 @@ class EmitterState:
     second_moment: Tree = field(default_factory=dict)
 
     def upsampled(self, upsampler: Upsampler) -> EmitterState:
-        """Return the state with interpolated mean squares of the gradient."""
         return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
     @property

@@ -92,7 +92,6 @@ class GradientSum:
 
 
 def _wide(x: Array) -> Array:
-    """Return a flat array in double precision."""
     kind: Any = dr.float64_array_t(dr.array_t(x))
     return kind(arrays.flat(x))
 

@@ -67,7 +67,6 @@ class HybridState:
     response: Response | None = None
 
     def upsampled(self, upsampler: Upsampler) -> HybridState:
-        """Return the state with upsampled states and running means."""
         return replace(
             self,
             path=upsampled(self.path, upsampler),
@@ -78,7 +77,6 @@ class HybridState:
         )
 
     def restarted(self, fresh: HybridState) -> HybridState:
-        """Return the restarted state, with the restarted states of both estimators. A block does not wait again."""
         parts = {name: restarted(getattr(self, name), getattr(fresh, name)) for name in ("path", "perturbed")}
         return replace(fresh, **parts, step=fresh.step if fresh.mean else self.step)
 

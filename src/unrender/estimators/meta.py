@@ -48,7 +48,6 @@ class MetaState:
         return self.parameters is None or trees.shapes(self.parameters) != trees.shapes(parameters)
 
     def upsampled(self, upsampler: Upsampler) -> MetaState:
-        """Return the state with interpolated gradients, moments and previous parameters."""
         image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
         if self.parameters is None:
             return replace(self, image=image, pixels=pixels)
@@ -59,7 +58,9 @@ class MetaState:
         ratio = old / new if new > 0 else 1.0
 
         def moments(key: str, old_state: meta.Moments, factor: float) -> meta.Moments:
-            mean = upsampler.array(key, old_state.mean, 1.0, factor) if old_state.has_mean else old_state.mean
+            mean = old_state.mean
+            if not isinstance(mean, float) and arrays.shape(mean) == arrays.shape(old_state.square):
+                mean = upsampler.array(key, mean, 1.0, factor)
             return meta.Moments(
                 mean, upsampler.array(key, old_state.square, SQUARES, factor * factor), old_state.weight
             )

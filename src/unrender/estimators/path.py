@@ -41,7 +41,6 @@ class PathGradientState:
     emitters: EmitterState | None = None
 
     def upsampled(self, upsampler: Upsampler) -> PathGradientState:
-        """Return the state with upsampled states of image estimator, pixel sampler and emitters."""
         emitters = None if self.emitters is None else self.emitters.upsampled(upsampler)
         image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
         return replace(self, image=image, pixels=pixels, emitters=emitters)

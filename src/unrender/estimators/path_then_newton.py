@@ -58,7 +58,6 @@ class PathThenNewtonState:
     square: np.ndarray
 
     def upsampled(self, upsampler: Upsampler) -> PathThenNewtonState:
-        """Return the state itself, since numbers have no resolution."""
         del upsampler
         return self
 

@@ -58,11 +58,9 @@ class SmoothedState:
     hessian: np.ndarray | None = None
 
     def upsampled(self, upsampler: Upsampler) -> SmoothedState:
-        """Return the state without its Hessian, which is estimated again."""
         return replace(self, hessian=None)
 
     def restarted(self, fresh: SmoothedState) -> SmoothedState:
-        """Return the state of the schedule of σ with a new Hessian."""
         return replace(self, hessian=fresh.hessian)
 
 

@@ -208,7 +208,6 @@ def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any
 
 
 def _mosaic(resolution: int) -> np.ndarray:
-    """Return rings of light and dark tiles in four colours, (resolution, resolution, 3)."""
     u, v = parts.grid(resolution)
     x, y = np.floor(8 * u) - 3.5, np.floor(8 * v) - 3.5
     tile = _COLOURS[(np.maximum(np.abs(x), np.abs(y)) + 2 * (np.abs(x) == np.abs(y))).astype(int) % 4]

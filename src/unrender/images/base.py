@@ -238,7 +238,6 @@ class Plain(WithoutSnapshot):
         return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
 
     def needs_full_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
-        """Return False."""
         return False
 
     def advance(self, parameters: Tree, state: PlainState, contributions: tuple[Any, ...]) -> PlainState:

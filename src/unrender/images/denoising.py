@@ -201,7 +201,6 @@ class Denoised(WithoutSnapshot):
 
     @property
     def space(self) -> Space | None:
-        """The space of `inner`."""
         return self.inner.space
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
@@ -226,7 +225,6 @@ class Denoised(WithoutSnapshot):
         return replace(estimate, filter=self._filter(problem), variance=None), contribution
 
     def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
-        """Return True."""
         return True
 
     def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:

@@ -133,7 +133,6 @@ class Method:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Prefix errors with the method's name."""
         try:
             yield
         except InputError as error:
@@ -141,7 +140,6 @@ class Method:
 
 
 def _decisions(plan: Plan) -> tuple[Any, ...]:
-    """Return all of a plan but its reasons."""
     return plan.estimator, plan.optimizer, dict(plan.settings), plan.other_starts
 
 
@@ -276,7 +274,6 @@ def choices(options: BaseModel, name: str) -> list[Any]:
 
 
 def _changed(options: BaseModel, name: str, value: Any) -> BaseModel | None:
-    """Return the options with another value of one of them; None if it is not allowed."""
     try:
         return type(options).model_validate({**options.model_dump(), name: value})
     except pydantic.ValidationError:
@@ -284,7 +281,6 @@ def _changed(options: BaseModel, name: str, value: Any) -> BaseModel | None:
 
 
 def _outcome(options: BaseModel, decide: Decide) -> Any:
-    """Return what options decide, or the error of incompatible options."""
     try:
         return decide(options)
     except InputError as error:

@@ -65,10 +65,6 @@ class Plan:
         """Return the problem with the settings of this plan. Raises `InputError` for an unsuitable setting."""
         return self.problem.configured(self.settings)
 
-    def bound_optimizer(self, problem: Problem) -> Optimizer:
-        """Return the optimizer for the meshes and repeated border columns of a problem's parameters."""
-        return bind(self.optimizer, problem.topology, problem.coordinates.repeated)
-
     def table(self) -> dict[str, Any]:
         """Return the plan as a TOML table: estimator, optimizer, settings by key, and keys of other starts.
 
@@ -152,7 +148,6 @@ def _component(table: Any, name: str, where: str) -> Any:
 
 
 def _settings_table(own: ParameterSettings) -> dict[str, Any]:
-    """Return the settings that are not None, as tables."""
     settings: dict[str, Any] = {}
     if own.parameterisation is not None:
         named = isinstance(own.parameterisation, str)

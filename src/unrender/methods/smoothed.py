@@ -222,7 +222,6 @@ def first_steps(sigma: float | str | None, problem: Problem, keys: Iterable[str]
 
 
 def _common(sigma: float | Mapping[str, float]) -> float:
-    """Return the width of parameters without their own."""
     return sigma.get("*", WIDTH) if isinstance(sigma, Mapping) else sigma
 
 

@@ -166,7 +166,6 @@ class AveragedNewton:
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
     ) -> tuple[Tree, AveragedNewtonState]:
-        """Return the steps and the next state. Computed on the host."""
         hessian = arrays.numpy(estimate.require("AveragedNewton", Hessian).matrix).astype(np.float64)
         gradient, x = trees.ravel(estimate.gradient), trees.ravel(parameters)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
@@ -218,7 +217,6 @@ class AveragedNewton:
         )  # fmt: skip
 
     def averages(self, keys: Iterable[str], state: Any = None) -> frozenset[str]:
-        """Return all keys."""
         del state
         return frozenset(keys)
 

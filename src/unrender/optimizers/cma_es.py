@@ -189,7 +189,6 @@ class _Search:
         return self._points
 
     def update(self, ranks: np.ndarray) -> None:
-        """Update by the ranks (population,) of the last points; no update if all are equal."""
         if ranks.any():
             with _quiet():
                 self._strategy.tell(list(self._points), ranks.astype(np.float64).tolist(), check_points=False)

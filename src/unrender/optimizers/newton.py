@@ -55,7 +55,6 @@ def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: floa
 
 
 def _ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return x / y, and 0 where x is 0."""
     return np.divide(x, y, out=np.zeros_like(x), where=x != 0.0)
 
 
@@ -107,7 +106,6 @@ class Newton:
         return init_state("Newton", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
-        """Return the steps and the next state. Computed on the host."""
         matrix = estimate.require("Newton", Hessian).matrix
         scale = coordinate_scales(estimate, state, parameters, self.learning_rate)
         hessian = scale[:, None] * arrays.numpy(matrix).astype(np.float64) * scale
@@ -185,7 +183,6 @@ class NewtonCG:
         return init_state("NewtonCG", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
-        """Return the steps and the next state. On the host, between products."""
         hvp = estimate.require("NewtonCG", HessianProduct).apply
         scale = coordinate_scales(estimate, state, parameters, self.learning_rate) * free_elements(estimate, parameters)
 
@@ -278,7 +275,6 @@ class LBFGS:
         return LBFGSState(init_state("LBFGS", self, parameters, learning_rates), none, none, rows, rows)
 
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
-        """Return the steps and the next state. Computed on the host."""
         scale = coordinate_scales(estimate, state.newton, parameters, self.learning_rate)
         here, gradient = trees.ravel(parameters), trees.ravel(estimate.gradient)
         if state.newton.step:

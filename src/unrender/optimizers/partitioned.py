@@ -36,11 +36,9 @@ class PartitionedState:
     others: Any
 
     def upsampled(self, upsampler: Upsampler) -> PartitionedState:
-        """Interpolate both states."""
         return PartitionedState(upsampled(self.own, upsampler), upsampled(self.others, upsampler))
 
     def restarted(self, fresh: PartitionedState) -> PartitionedState:
-        """Restart both states."""
         return PartitionedState(restarted(self.own, fresh.own), restarted(self.others, fresh.others))
 
 
@@ -120,7 +118,6 @@ class Partitioned:
         )
 
     def averages(self, keys: Iterable[str], state: PartitionedState | None = None) -> frozenset[str]:
-        """Return the keys that one of the two optimizers averages."""
         del state
         all_keys = frozenset(keys)
         return averaged_by(self.optimizer, all_keys.intersection(self.keys)) | averaged_by(
@@ -133,7 +130,6 @@ class Partitioned:
         return frozenset().union(*(part.unsettled(*of) for part, *of in both if isinstance(part, Settling)))
 
     def choices(self, state: PartitionedState) -> tuple[str, ...]:
-        """Return the choices of both optimizers, one line each."""
         both = ((self.optimizer, state.own), (self.others, state.others))
         return tuple(line for part, of in both if isinstance(part, Choosing) for line in part.choices(of))
 
@@ -163,7 +159,6 @@ class SuccessiveState:
     changed: bool = False
 
     def upsampled(self, upsampler: Upsampler) -> SuccessiveState:
-        """Interpolate both states."""
         return SuccessiveState(upsampled(self.first, upsampler), upsampled(self.then, upsampler), self.changed)
 
 
@@ -187,7 +182,6 @@ class Successive(checks.Checked):
         return SuccessiveState(self.first.init(parameters, learning_rates), self.then.init(parameters))
 
     def update(self, estimate: Estimate, state: SuccessiveState, parameters: Tree) -> tuple[Tree, SuccessiveState]:
-        """Return the steps and the next state."""
         block = estimate.require("Successive", BlockEstimate).estimate
         if block is None:
             steps, first = self.first.update(estimate, state.first, parameters)
@@ -208,5 +202,4 @@ class Successive(checks.Checked):
         return self.then.unsettled(state.then, parameters) if state.changed else frozenset()
 
     def choices(self, state: SuccessiveState) -> tuple[str, ...]:
-        """Return the choices of the first optimizer, one line each."""
         return self.first.choices(state.first) if isinstance(self.first, Choosing) else ()

@@ -50,7 +50,6 @@ class ChainState:
         raise KeyError(kind.__name__)
 
     def upsampled(self, upsampler: Upsampler) -> ChainState:
-        """Interpolate each of the states."""
         return replace(self, states=tuple(upsampled(state, upsampler) for state in self.states))
 
     def restarted(self, fresh: ChainState) -> ChainState:
@@ -101,7 +100,6 @@ class Recipe(ABC):
         return steps, replace(state, step=state.step + 1, states=tuple(states))
 
     def choices(self, state: ChainState) -> tuple[str, ...]:
-        """Return the choices of the transforms, one line each."""
         made, pairs = state.step - state.begun, zip(self._composed, state.states, strict=True)
         return tuple(line for part, own in pairs for line in part.choices(own, made))
 

@@ -101,11 +101,9 @@ class Around(Generic[_Inner]):
     columns: int
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """Raise `InputError` if `inner` does not support the interior columns."""
         self.inner.check(key, periodic.interior_shape(shape, self.columns))
 
     def apply(self, x: Array) -> Array:
-        """Return S x, with the shape and type of `x`."""
         result = self.inner.apply(periodic.interior(arrays.numpy(x), self.columns))
         return arrays.like(periodic.pad(result, self.columns), x)
 

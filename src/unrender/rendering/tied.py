@@ -187,7 +187,6 @@ class TiedSession(DerivedSession):
         return self._renderer.scene_values(own)
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
-        """Return the gradient by the unknowns. The gradient by a tie is the sum of its members' gradients times their factors."""
         gradient: Tree = {}
         for key in parameters:
             factors = self._renderer.factors.get(key, {key: 1.0})

@@ -345,7 +345,6 @@ def _as_if(residuals: Residuals, images: np.ndarray) -> tuple[str, float, bool]:
 
 
 def _joined(problem: Problem, pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the pixels (N, 3) of pictures of all views, in the units of `Residuals.of`."""
     pairs = zip(pictures, problem.units, strict=True)
     return np.concatenate([np.reshape(picture, (-1, 3)) * unit for picture, unit in pairs]).astype(np.float64)
 

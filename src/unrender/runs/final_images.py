@@ -302,7 +302,6 @@ def _without(errors: Mapping[str, np.ndarray], keys: Sequence[str]) -> dict[str,
 
 
 def _chosen(problem: Problem) -> list[int]:
-    """Return the views to render: all, or an even selection of many large ones."""
     largest = max(height * width for height, width in problem.sizes)
     most, count = max(1, _MOST_BYTES // (_PICTURES * 12 * largest)), len(problem.views)
     if not problem.references.in_host_memory or count <= most:

@@ -26,8 +26,8 @@ from unrender.estimators.coordinates import (
 )
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
-from unrender.methods.plan import Plan
-from unrender.optimizers.base import Measuring
+from unrender.methods.plan import Plan, bind
+from unrender.optimizers.base import Measuring, Optimizer
 from unrender.runs.budget import shorter_steps
 from unrender.runs.callbacks import COMPILING
 from unrender.runs.metadata import described, first_values
@@ -48,7 +48,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
     """Return a run before its first step. Raises `InputError` for a seed that files cannot store."""
     seed = check_seed("seed", seed)
     problem, estimator = plan.configured(), plan.estimator
-    optimizer = plan.bound_optimizer(problem)
+    optimizer: Optimizer = bind(plan.optimizer, problem.topology, problem.coordinates.repeated)
     problem.executor.check(estimator)
     if isinstance(estimator, GaussNewton) and not isinstance(optimizer, Measuring):
         estimator = replace(estimator, scores=False)

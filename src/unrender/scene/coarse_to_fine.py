@@ -70,10 +70,6 @@ class CoarseToFine:
         """Return all shapes of the parameter during a run."""
         return {self.shape(full, step) for step in (0, *self.steps)}
 
-    def coarsened(self, values: np.ndarray, step: int) -> np.ndarray:
-        """Downsample values from the scene's resolution to that of a step."""
-        return resampling.downsample(values, self.shape(values.shape, step)[:-1])
-
     def refined(self, values: np.ndarray, shape: Sequence[int]) -> np.ndarray:
         """Upsample values from a coarser resolution to that of `shape`. Linear in the values."""
         wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (values.ndim - 1)

@@ -15,6 +15,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.text import in_words
+from unrender.io import resampling
 from unrender.io.toml_lines import FieldError
 from unrender.parameterisations import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
@@ -265,8 +266,8 @@ class Unknown:
 
     def start(self, step: int) -> np.ndarray:
         """Return `first`, or `initial` if it is None, at the resolution of a step."""
-        first = self.initial if self.first is None else self.first
-        return first if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(first, step)
+        first, levels = self.initial if self.first is None else self.first, self.coarse_to_fine
+        return first if levels is None else resampling.downsample(first, levels.shape(first.shape, step)[:-1])
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """Return values at the scene's resolution; coarser ones are interpolated."""

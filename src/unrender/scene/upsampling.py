@@ -80,7 +80,6 @@ class Unchanged:
     """Base of a state in which nothing has a parameter's shape."""
 
     def upsampled(self, upsampler: Upsampler) -> Any:
-        """Return this state."""
         return self
 
 

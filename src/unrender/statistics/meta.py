@@ -66,11 +66,6 @@ class Moments:
     square: Array
     weight: Array
 
-    @property
-    def has_mean(self) -> bool:
-        """Return whether `mean` is an array with one value per element."""
-        return not isinstance(self.mean, float) and arrays.shape(self.mean) == arrays.shape(self.square)
-
 
 @dataclass(frozen=True)
 class State:

@@ -241,7 +241,6 @@ def _meshes(mesh: Mesh | None) -> Iterator[tuple[str, str, Mesh]]:
 
 
 def _fit(views: CapturedViews, mesh: Mesh | None) -> float:
-    """Return the mean overlap; 0 if the hull is empty."""
     try:
         shape = visual_hull(views, _VOXELS) if mesh is None else mesh
     except InputError:
@@ -250,7 +249,6 @@ def _fit(views: CapturedViews, mesh: Mesh | None) -> float:
 
 
 def _reduced(view: CapturedView) -> CapturedView:
-    """Return the view at about a fourth of its resolution."""
     factor = max(1, min(view.lens.width, view.lens.height) // 48)
     width, height = view.lens.width // factor, view.lens.height // factor
 

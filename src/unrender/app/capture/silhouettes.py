@@ -110,7 +110,6 @@ def _enlarged(picture: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _outline(inside: np.ndarray) -> np.ndarray:
-    """Return the pixels inside that have a neighbour outside."""
     padded = np.pad(inside, 1, mode="edge")
     surrounded = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return inside & ~surrounded

@@ -225,7 +225,6 @@ def check_problem(name: str, options: Mapping[str, str], cached: bool = True) ->
 
 
 def _check_known(name: str) -> None:
-    """Raise `InputError` for a name that is neither that of a file nor in the gallery, and for a folder."""
     if (_is_file(name) and not Path(name).is_dir()) or is_gallery(name):
         return
     if Path(name).is_dir():

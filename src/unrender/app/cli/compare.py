@@ -171,7 +171,6 @@ def _check_single(what: Sequence[str]) -> None:
 def _compare_folders(
     console: Console, context: typer.Context, directories: Sequence[Path], out: Path | None, overwrite: bool
 ) -> None:
-    """Compare earlier runs. Raise `InputError` for options that only apply to new runs."""
     if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
         raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
     folder = arguments.folder(out, "compare", overwrite, *_MARKS)

@@ -282,7 +282,6 @@ def _photographed(
 
 
 def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
-    """Multiply the channels of a rendering by the factors that bring it closest to the photograph inside the mask."""
     mask = view.pixel_weights() > 0
     return image * best_factors(image[mask], np.asarray(view.reference)[mask])
 

@@ -104,7 +104,6 @@ _ROUNDING = 1e-4
 
 
 def _check_gltf_installed() -> None:
-    """Raise `InputError` if the package that writes glTF is missing."""
     if importlib.util.find_spec("pygltflib") is None:
         raise InputError("--format glb needs pygltflib: pip install 'unrender[capture]'")
 

@@ -200,7 +200,6 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
 
 
 def _swatch(array: np.ndarray) -> str:
-    """Return the colour of a parameter of three values within [0, 1] as #rrggbb; "" for other parameters."""
     if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
         return ""
     return "#" + "".join(f"{round(255 * float(value)):02x}" for value in tone_mapping.srgb(array.reshape(-1)))

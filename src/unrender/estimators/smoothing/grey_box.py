@@ -167,7 +167,6 @@ def _scale(scales: Sequence[torch.Tensor] | None, weights: Sequence[torch.Tensor
 
 
 def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: torch.optim.Optimizer | None) -> None:
-    """Add the step, all weights flattened in one vector, or pass its negative to the optimizer as the gradient."""
     with torch.no_grad():
         for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
             move = part.reshape(weight.shape).to(weight)
@@ -181,7 +180,6 @@ def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: 
 
 
 def _ravel(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return all elements in one vector on the host, in double precision, differentiable."""
     return torch.cat([x.reshape(-1).to("cpu", torch.float64) for x in tensors])
 
 

@@ -146,7 +146,6 @@ class TransformState:
     """State whose fields declare in metadata how a finer resolution scales them: `VALUES`, `GRADIENTS` or `MEAN_SQUARES`."""
 
     def upsampled(self, upsampler: Upsampler) -> Any:
-        """Interpolate the fields, and scale them by their metadata."""
         powers = {each.name: each.metadata["power"] for each in fields(self) if "power" in each.metadata}
         return replace(self, **{name: upsampler.tree(getattr(self, name), power) for name, power in powers.items()})
 

@@ -22,7 +22,6 @@ from unrender.rendering.renderer import SampleRequest
 
 
 def _seed(sampler: Any, seed: Any, lanes: int) -> None:
-    """Seed a sampler. Raise `InputError` for more lanes than Dr.Jit supports."""
     if lanes >= 1 << 32:
         raise InputError(f"{lanes} camera rays: a launch is limited to fewer than 2³²; reduce the samples per pixel")
     sampler.seed(seed, lanes)

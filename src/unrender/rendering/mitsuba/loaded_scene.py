@@ -380,5 +380,4 @@ def _copy(value: mi.TensorXf) -> mi.TensorXf:
 
 
 def _reference(value: Any) -> Any:
-    """Return another reference to the same memory."""
     return type(value)(value)

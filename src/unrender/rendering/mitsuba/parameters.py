@@ -19,7 +19,7 @@ from unrender.core import arrays
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.mesh_layout import FACES, NORMALS, POSITIONS, TEXCOORDS
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph, children
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, attribute, children
 from unrender.rendering.parameter_errors import Role
 
 # BSDFs whose delta lobes have directions that do not depend on the parameter. Sampling that lobe alone gives its value in the
@@ -110,9 +110,9 @@ def shows(aov: str, parameters: mi.SceneParameters, key: str, graph: ObjectGraph
 def _chains(parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> list[list[Any]]:
     """Return the chains of objects through which a parameter affects the image. Each begins with the object that reads it."""
     leaf, node = key.rsplit(".", 1)[-1], parameters.properties[key][2]
-    attribute = leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
-    if isinstance(node, mi.Mesh) and attribute:
-        readers = graph.attribute_readers(node, leaf)
+    is_attribute = leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
+    if isinstance(node, mi.Mesh) and is_attribute:
+        readers = (texture for texture in graph.nodes if attribute(texture)[0] == leaf)
         return [chain for reader in readers for chain in graph.chains(reader) if node in chain]
     chains = list(graph.chains(node))
     # a texture that the scene itself holds has no effect there

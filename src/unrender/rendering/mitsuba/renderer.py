@@ -143,7 +143,6 @@ class MitsubaRenderer:
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
-        """Return the scene's own values, as loaded."""
         known = self._poses | self._turned
         return {key: self.array(known[key].loaded()) if key in known else self.pair.loaded().value(key) for key in keys}
 

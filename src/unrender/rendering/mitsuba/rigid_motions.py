@@ -104,7 +104,6 @@ class RigidMotions:
 
 
 def _copy(transform: Any) -> Any:
-    """Return a copy: a sensor returns a reference to the matrix that it uses."""
     return type(transform)(transform)
 
 

@@ -67,14 +67,6 @@ class ObjectGraph:
         """Return the objects of a kind: "bsdf", "emitter", "medium" or "shape"."""
         return [node for node in self.nodes if isinstance(node, getattr(mi, _KINDS[kind]))]
 
-    def attribute_readers(self, shape: Any, name: str) -> list[Any]:
-        """Return the textures of a shape's BSDF that read its attribute `name`."""
-        return [
-            node
-            for node in self.nodes
-            if attribute(node)[0] == name and any(shape in chain for chain in self.chains(node))
-        ]
-
     def attributed(self, ids: Collection[str]) -> list[str]:
         """Return the shapes of these ids whose materials read attributes of vertices.
 

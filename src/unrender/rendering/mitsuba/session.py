@@ -171,7 +171,6 @@ class MitsubaSession:
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render an unbiased image of each group."""
         batched = parameters and self._posed is not None and not self._attached
         if batched and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}

@@ -149,10 +149,8 @@ def remove_partial(folder: Path) -> None:
 
 
 def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
-    try:
+    with files.input_errors(f"{path}: cannot be read"):
         size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if size != manifest.size:
         raise InputError(f"{path}: expected {manifest.size} bytes, as the manifest says, got {size}")
     data = bounded_files.read_bytes(path, min(manifest.size, _LARGEST_STATE), path.parent)

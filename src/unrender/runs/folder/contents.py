@@ -10,7 +10,6 @@ import numpy as np
 
 from unrender.backend.variant import current
 from unrender.backend.versions import hardware, versions
-from unrender.core.errors import InputError
 from unrender.core.text import plain
 from unrender.io import files
 from unrender.runs.folder import history, schema
@@ -62,14 +61,12 @@ def write_record(folder: Path, result: Result, status: str, error: str = "") -> 
 def write_result(folder: Path, result: Result, status: str) -> None:
     """Write history, arrays and, last, run.json, each atomically and on disk. Raises `InputError` if that or reading it would fail."""
     check_writable(folder, result, status)
-    try:
+    with files.input_errors(f"run folder {folder}: cannot be written"):
         files.make_folder(folder)
         write_arrays(folder, result)
         files.write(folder / schema.HISTORY, history.lines(result.history), name_too=False)
         files.sync_folder(folder)
         write_record(folder, result, status)
-    except OSError as error:
-        raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
 
 
 def encoded_record(folder: Path, result: Result, status: str, error: str = "") -> bytes:

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import drjit as dr
-import pydantic
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.core.errors import InputError
 from unrender.io import bounded_files, toml_lines
+from unrender.runs.folder import schema
 from unrender.runs.run import Run
 
 _LONGEST = 1 << 20
@@ -73,10 +72,4 @@ def encode(method: Mapping[str, Any], path: Path) -> bytes:
 
 
 def _parse(text: str, path: Path) -> Method:
-    contents = toml_lines.parse(text, str(path))
-    try:
-        return Method.model_validate(contents)
-    except pydantic.ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"][:1]) or "the file"
-        raise InputError(f"{path}: {field[:80]}: {first['msg'].lower()}, got {repr(first['input'])[:60]}") from error
+    return schema.validate(Method, toml_lines.parse(text, str(path)), str(path))

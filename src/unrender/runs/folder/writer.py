@@ -131,38 +131,33 @@ class RunWriter(Callback):
         """
         contents.check_writable(self.folder, result, "running")
         method_file.encode(self.method, self.folder / METHOD)
-        try:
-            if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
-                _clear(self.folder)
-            _sweep(self.folder)
-            self._write_start(result)
-            self._started = True
-        except OSError as error:
-            raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
-        except (KeyboardInterrupt, InputError):
-            with contextlib.suppress(OSError):
-                _clear(self.folder)  # files without run.json are not recognised as a run
-            raise
+        with self._writing():
+            try:
+                if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
+                    _clear(self.folder)
+                _sweep(self.folder)
+                self._write_start(result)
+                self._started = True
+            except (KeyboardInterrupt, InputError):
+                with contextlib.suppress(OSError):
+                    _clear(self.folder)  # files without run.json are not recognised as a run
+                raise
 
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
         """Continue after `records`, with which the history is rewritten. Raises `InputError` if that fails."""
-        try:
+        with self._writing():
             _sweep(self.folder)
             self._history.rewrite(records)
             files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD))
             contents.write_record(self.folder, result, "running")
             self._written_step, self._started = result.steps, True
-        except OSError as error:
-            raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of the final pictures, so that nothing compiles after the last step. Write another plan of the run."""
         if run.replanned:
             self.method = method_file.serialize(run, self.method["name"], self.checkpoint_every, self.final_spp)
-            try:
+            with self._writing():
                 self._write_method(run.result())
-            except OSError as error:
-                raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
         if self.final_spp != 1 and not run.stopped:
             run.tested = can_test(run)
             with phases.phase(callbacks.COMPILING):
@@ -266,11 +261,12 @@ class RunWriter(Callback):
 
     # ------------------------------------------------------------------ the writing
 
+    def _writing(self) -> contextlib.AbstractContextManager[None]:
+        return files.input_errors(f"run folder {self.folder}: cannot be written")
+
     def _acquire(self) -> None:
-        try:
+        with files.input_errors(f"run folder {self.folder}"):
             files.make_folder(self.folder)
-        except OSError as error:
-            raise InputError(f"run folder {self.folder}: {error.strerror or error}") from error
         self._lock.acquire()
 
     def _save(self, result: Result, status: str) -> None:
