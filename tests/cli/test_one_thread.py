@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.io import images
 
 SCRIPT = """
@@ -56,3 +59,34 @@ def test_exr_files_are_read_and_written(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_picture_waits_for_another_thread_that_renders(tmp_path: Path) -> None:
+    """To change the number of threads beside a render waited for ever: seen within 30 s, where two threads read 84 files."""
+    file = tmp_path / "sky.exr"
+    images.write(np.ones((4, 4, 3)), file)
+    rendering, rendered, order = threading.Event(), threading.Event(), []
+
+    def render(long: bool) -> None:
+        with exclusive("render", long):
+            rendering.set()
+            rendered.wait(60)
+            order.append("rendered")
+
+    for long in (False, True):
+        rendering.clear()
+        rendered.clear()
+        thread = threading.Thread(target=render, args=(long,))
+        thread.start()
+        rendering.wait(60)
+        if long:
+            with pytest.raises(InputError, match=r"with one thread of Dr\.Jit: render is running in another thread"):
+                images.read(file)
+            rendered.set()
+        else:
+            threading.Timer(0.2, rendered.set).start()
+            images.read(file)
+            order.append("read")
+        thread.join()
+    assert order == ["rendered", "read", "rendered"]

@@ -19,6 +19,7 @@ from typing import Any
 
 from unrender.backend import cache, install_hints, limits, llvm, plugins
 from unrender.core.errors import InputError, VariantError
+from unrender.core.exclusive import exclusive
 from unrender.core.text import did_you_mean, in_words, reason_of
 
 CUDA = "cuda_ad_rgb"
@@ -202,20 +203,25 @@ def use_threads(count: int) -> None:
 
 @contextlib.contextmanager
 def two_threads() -> Iterator[None]:
-    """Give Dr.Jit at least two threads within this context: with one, Mitsuba's OpenEXR deadlocks on files."""
+    """Give Dr.Jit at least two threads within this context: with one, Mitsuba's OpenEXR deadlocks on files.
+
+    A change of their number while another thread of Python renders would deadlock, too: the context waits for its turn, and raises
+    `InputError` during another thread's run.
+    """
     ensure()
     import drjit as dr
 
     if dr.thread_count() > 1:
         yield
         return
-    dr.sync_thread()
-    dr.set_thread_count(2)
-    try:
-        yield
-    finally:
+    with exclusive("a picture or scene file, with one thread of Dr.Jit"):
         dr.sync_thread()
-        dr.set_thread_count(1)
+        dr.set_thread_count(2)
+        try:
+            yield
+        finally:
+            dr.sync_thread()
+            dr.set_thread_count(1)
 
 
 def current() -> str | None:
