@@ -22,12 +22,13 @@ class Capability:
 
     name: ClassVar[str]
 
+    def __init_subclass__(cls, name: str = ""):
+        cls.name = name
+
 
 @dataclass(frozen=True)
-class Gradient(Capability):
+class Gradient(Capability, name="gradient"):
     """Marker for `provides` and `requires`: `Estimate.gradient` has an entry for every parameter. The value is a field of `Estimate`."""
-
-    name: ClassVar[str] = "gradient"
 
 
 @dataclass(frozen=True)
@@ -53,106 +54,87 @@ class MatrixCapability(Capability):
 
 
 @dataclass(frozen=True)
-class Variance(TreeCapability):
+class Variance(TreeCapability, name="variance"):
     """Variance of the gradient, >= 0."""
-
-    name: ClassVar[str] = "variance"
 
 
 @dataclass(frozen=True)
-class FreshGradient(TreeCapability):
+class FreshGradient(TreeCapability, name="fresh_gradient"):
     """Gradient from this step's samples alone. Its noise has mean 0, independent of earlier samples.
 
     Estimators that reuse earlier samples provide it in some of their steps.
     """
 
-    name: ClassVar[str] = "fresh_gradient"
-
 
 @dataclass(frozen=True)
-class GradientAtBounds(TreeCapability):
+class GradientAtBounds(TreeCapability, name="gradient_at_bounds"):
     """Gradient of this step's samples with respect to x, of an estimate with respect to v. It tells which elements stay at their bounds.
 
     It has values for the parameters with bounds and a preconditioner, or for some of them.
     """
 
-    name: ClassVar[str] = "gradient_at_bounds"
-
 
 @dataclass(frozen=True)
-class NoiseSample(TreeCapability):
+class NoiseSample(TreeCapability, name="noise_sample"):
     """One sample of the gradient's noise, of mean 0 and about the gradient's variance."""
 
-    name: ClassVar[str] = "noise_sample"
-
 
 @dataclass(frozen=True)
-class Hessian(MatrixCapability):
+class Hessian(MatrixCapability, name="hessian"):
     """Hessian of the loss."""
 
-    name: ClassVar[str] = "hessian"
-
 
 @dataclass(frozen=True)
-class HessianNoise(MatrixCapability):
+class HessianNoise(MatrixCapability, name="hessian_noise"):
     """Noise that squared derivative images would add to the Gauss-Newton matrix: Σ ℓ'' N Nᵀ over pixels, with the noise N of the images.
 
     It is positive semidefinite. Damping by it prevents steps along noisy directions.
     """
 
-    name: ClassVar[str] = "hessian_noise"
-
 
 @dataclass(frozen=True)
-class GradientNoise(MatrixCapability):
+class GradientNoise(MatrixCapability, name="gradient_noise"):
     """Covariance of the gradient from this step's samples. Trust-region steps are damped along directions that noise dominates."""
 
-    name: ClassVar[str] = "gradient_noise"
-
 
 @dataclass(frozen=True)
-class ScoreCovariance(MatrixCapability):
+class ScoreCovariance(MatrixCapability, name="score_covariance"):
     """Covariance of the loss gradient from the references' noise, as the residual shows it (`statistics.scores.covariance`).
 
     Noise may give it negative eigenvalues.
     """
 
-    name: ClassVar[str] = "score_covariance"
-
 
 @dataclass(frozen=True)
-class HessianProduct(Capability):
+class HessianProduct(Capability, name="hvp"):
     """Products of the Hessian of the loss with vectors.
 
     Attributes:
         apply: function from a tree v with the parameters' keys and shapes to H v.
     """
 
-    name: ClassVar[str] = "hvp"
     apply: Callable[[Tree], Tree]
 
 
 @dataclass(frozen=True)
-class LossFunction(Capability):
+class LossFunction(Capability, name="losses"):
     """The loss as a function of the parameters, evaluated with this step's random numbers.
 
     Attributes:
         evaluate: function from points (B, n), all parameters flattened in key order, to losses (B,); NumPy arrays.
     """
 
-    name: ClassVar[str] = "losses"
     evaluate: Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Smoothing(Capability):
+class Smoothing(Capability, name="sigma"):
     """The derivatives are those of the loss smoothed by a Gaussian over the parameters. Trust regions are in units of its σ.
 
     Attributes:
         sigma: {key: standard deviation in units of the parameter}, > 0: a number, or one for each element.
     """
 
-    name: ClassVar[str] = "sigma"
     sigma: Mapping[str, float | np.ndarray]
 
 
@@ -162,7 +144,7 @@ of unknown brightness."""
 
 
 @dataclass(frozen=True)
-class AtBounds(Capability):
+class AtBounds(Capability, name="at_bounds"):
     """Elements at a bound, which the loop adds for the optimizer.
 
     Attributes:
@@ -170,7 +152,6 @@ class AtBounds(Capability):
             0 elsewhere, and for parameters with a preconditioner, whose steps have other coordinates.
     """
 
-    name: ClassVar[str] = "at_bounds"
     sides: Callable[[], Tree]
 
     def held(self, mean: Tree, made: int) -> Tree:
@@ -188,7 +169,7 @@ class AtBounds(Capability):
 
 
 @dataclass(frozen=True)
-class DerivativeImages(Capability):
+class DerivativeImages(Capability, name="derivative_images"):
     """Derivative images of every element, by view. They are total derivatives where other parameters are eliminated.
 
     Attributes:
@@ -196,12 +177,11 @@ class DerivativeImages(Capability):
             them, (m, H, W, 3), and the second derivative of the loss by each value of the image times the weight of its noise, (H, W, 3).
     """
 
-    name: ClassVar[str] = "derivative_images"
     views: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class BlockEstimate(Capability):
+class BlockEstimate(Capability, name="block"):
     """Estimate for a subset of the parameters, with their own curvature.
 
     The other parameters are fixed at their current values, except those that the estimator eliminates, which are linear functions of the
@@ -212,7 +192,6 @@ class BlockEstimate(Capability):
         estimate: an `Estimate` whose gradient has these keys; None in a step in which they do not change.
     """
 
-    name: ClassVar[str] = "block"
     keys: tuple[str, ...]
     estimate: Any
 

@@ -58,7 +58,6 @@ class PathThenNewtonState:
     square: np.ndarray
 
     def upsampled(self, upsampler: Upsampler) -> PathThenNewtonState:
-        del upsampler
         return self
 
 

@@ -117,7 +117,6 @@ def _oidn(picture: np.ndarray, fast: bool) -> np.ndarray:
 def _optix(picture: np.ndarray, fast: bool) -> np.ndarray:
     import mitsuba as mi
 
-    del fast
     noisy = _continued(picture)
     denoiser = _optix_denoiser(noisy.shape[1], noisy.shape[0])
     return _as(np.array(denoiser(mi.TensorXf(noisy)).numpy()), picture)

@@ -217,7 +217,6 @@ class AveragedNewton:
         )  # fmt: skip
 
     def averages(self, keys: Iterable[str], state: Any = None) -> frozenset[str]:
-        del state
         return frozenset(keys)
 
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:

@@ -34,7 +34,6 @@ class NewtonState:
 
     def upsampled(self, upsampler: Upsampler) -> NewtonState:
         """Return this state. Raises `NotCarried` with an inner Adam, whose moments are on the host."""
-        del upsampler
         if self.adam is not None:
             raise NotCarried("Newton's Adam")
         return self

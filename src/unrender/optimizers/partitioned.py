@@ -118,7 +118,6 @@ class Partitioned:
         )
 
     def averages(self, keys: Iterable[str], state: PartitionedState | None = None) -> frozenset[str]:
-        del state
         all_keys = frozenset(keys)
         return averaged_by(self.optimizer, all_keys.intersection(self.keys)) | averaged_by(
             self.others, all_keys.difference(self.keys)

@@ -85,7 +85,6 @@ class NumberMeans(Callback):
     """Callback that records the numbers of a run at each step, for `averaged`."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        del record
         if shapes := numbers_of(run.problem, run.optimizer, run.state.optimizer):
             values = [arrays.numpy(run.parameters[key]).astype(np.float64).ravel() for key in shapes]
             run.state.numbers.append(np.concatenate(values))

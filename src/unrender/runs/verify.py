@@ -91,7 +91,6 @@ class Verify(Callback):
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Render the start, which also compiles the kernels of fresh pictures, so that nothing compiles after the last step."""
-        del fresh, warm
         with phases.phase(callbacks.COMPILING):
             self._small = FreshPictures(run.problem, run.seed, 0, _SMALL)
             if _other_meshes(run.problem):
@@ -102,7 +101,6 @@ class Verify(Callback):
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
-        del record
         pictures = self._small
         if pictures is None or run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
             return

@@ -113,15 +113,14 @@ class StepTransform(ABC):
     sets_steps: ClassVar[bool] = False
     """Whether `update` sets `StepUpdate.steps`. Later transforms cannot change these."""
 
-    @abstractmethod
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Any:
-        """Return the state before the first step: a frozen dataclass of arrays, or None.
+        """Return the state before the first step: a frozen dataclass of arrays; None by default.
 
         Args:
             parameters: Initial values, {key: array}.
             learning_rates: {key: η}, in units of the parameter.
         """
-        ...
+        return None
 
     @abstractmethod
     def update(self, update: StepUpdate, state: Any) -> tuple[StepUpdate, Any]:

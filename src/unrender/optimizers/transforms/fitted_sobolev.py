@@ -371,9 +371,6 @@ class ApplyPreconditioner(StepTransform):
     With `FittedSobolev` before it and a scaling in between, the parameter moves along S (S g / scale).
     """
 
-    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        del parameters, learning_rates
-
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
         direction = dict(update.direction)
         for key, change in update.smoothing.items():

@@ -107,9 +107,6 @@ class ScaleByDeviation(checks.Checked, StepTransform):
 
     requires = (Variance,)
 
-    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        del parameters, learning_rates
-
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
         variance = update.estimate.require("ScaleByDeviation", Variance).values
         direction = {key: x / arrays.sqrt(variance[key] + self.epsilon) for key, x in update.direction.items()}
@@ -126,9 +123,6 @@ class ClipDirection(checks.Checked, StepTransform):
     """
 
     longest: Positive = 1.0
-
-    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
         most = self.longest * update.divisor

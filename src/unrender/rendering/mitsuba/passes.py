@@ -121,7 +121,6 @@ class Pass:
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         """Return the call that traces the camera rays, by default without derivatives; `own` are the pass's own arrays."""
-        del size, own
         return paths.primal()
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
