@@ -121,11 +121,15 @@ class BlackBox:
             return images, self.problem.loss_values(view, images)
         first = request.spp // 2
         a = session.image_batch(states, replace(request, spp=first))
-        independent = Key(request.seed, 1).uint32()
-        b = session.image_batch(states, replace(request, spp=request.spp - first, seed=independent))
+        b = session.image_batch(states, replace(request, spp=request.spp - first, seed=_other(request.seed)))
         share = first / request.spp
         images = a * share + b * (1.0 - share)
         loss_of_halves = self.problem.loss_values(view, a) * share + self.problem.loss_values(view, b) * (1.0 - share)
         # Let Q be the quadratic loss of the noise of one sample. The loss of the mean of n samples is L + Q / n, that of the halves
         # L + 2 Q / n.
         return images, self.problem.loss_values(view, images) * 2.0 - loss_of_halves
+
+
+def _other(seed: int) -> int:
+    """Return the seed of independent random numbers."""
+    return Key(seed, 1).uint32()
