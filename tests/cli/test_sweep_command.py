@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ import unrender as ur
 from unrender.app.cli import tasks
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, WAITING
 from unrender.app.sweeps.record import write_sweep
+from unrender.gallery import analytic
 from unrender.runs.budget import Budget
+from unrender.scene.problem import Problem
 
 TOY = ["quad", "--method", "plain", "--steps", 20, "--final-spp", 1]
 GRID = [*TOY, "--over", "learning_rate=0.03,0.3"]
@@ -117,6 +120,26 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
 
 
 @pytest.mark.slow
+def test_a_sweep_of_a_gallery_problem_that_has_changed_is_not_continued(unrender, monkeypatch: Any) -> None:
+    over = ["--over", "learning_rate=0.001:0.1:log", "--search", "random", "--trials", 1, "--steps", 2, "--out", "s"]
+    assert unrender("sweep", "exponential", "-m", "plain", *over).status == 0
+    build = analytic.Exponential.problem
+    for change, words in (
+        ({"initial": 1.6}, "initial was () of mean 1.5 and deviation 0, is () of mean 1.6 and deviation 0"),
+        ({"learning_rate": 0.5}, "learning_rate was None, is 0.5"),
+    ):
+
+        def changed(self: Any, name: str, change: Any = change) -> Problem:
+            made = build(self, name)
+            return made.replaced(parameters=[replace(made.parameters[0], **change)])
+
+        monkeypatch.setattr(analytic.Exponential, "problem", changed)
+        answer = unrender("sweep", "s", "--trials", 2)
+        assert answer.refuses(f"trial 0: parameter rate: {words}; begin another sweep, or take the change back")
+    monkeypatch.setattr(analytic.Exponential, "problem", build)
+    assert unrender("sweep", "s", "--trials", 2).status == 0
+
+
 def test_a_sweep_whose_problem_has_changed_is_not_continued(unrender, problem: Path, mitsuba_variant: str) -> None:
     over = ["--over", "learning_rate=0.001:0.1:log", "--search", "random", "--trials", 1, "--steps", 2]
     over += ["--final-spp", 2, "--variant", mitsuba_variant, "--out", "s"]

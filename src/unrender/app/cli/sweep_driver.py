@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import typer
 from rich.table import Table
 from rich.text import Text
@@ -51,6 +52,8 @@ from unrender.scene.problem import Problem
 _SHOWN = 10
 _COMPUTED = re.compile(r"scene|value of the expression")
 """Parts of a fingerprint that a device computes from other parts."""
+_RENDERED = re.compile(rf"{_COMPUTED.pattern}|view \d+: reference|loss near")
+"""Those of a gallery problem."""
 _LONGEST_PART = 200
 _MANY = 1e9  # degrees of freedom of a standard error that is known
 
@@ -278,22 +281,29 @@ def _executor(console: Console, session: Session, state: _State) -> Iterator[tup
 
 
 def _checked_definition(folder: Path, record: SweepRecord, problem: Problem) -> dict[str, str]:
-    """Return the parts of a problem that its files define. Raise `InputError` if one has changed since the first run of the sweep, whose
-    error was another one."""
-    if "file" not in problem.origin:
-        return {}
-    parts = {part: text for part, text in fingerprint(problem).items() if not _COMPUTED.match(part)}
+    """Return the parts of a problem that its files, or the gallery, define. Raise `InputError` if one has changed since the first run of
+    the sweep, whose error was another one."""
+    gallery = "file" not in problem.origin
+    computed = _RENDERED if gallery else _COMPUTED
+    parts = {part: text for part, text in fingerprint(problem).items() if not computed.match(part)}
     for key, unknown in problem.unknowns.items():
-        if unknown.parameter.initial is None:  # the scene's, of which the files are parts
+        if gallery:
+            parts[f"parameter {key}: initial"] = _moments(unknown.initial)
+        elif unknown.parameter.initial is None:  # the scene's, of which the files are parts
             del parts[f"parameter {key}: initial"]
         if unknown.truth is not None:
-            parts[f"parameter {key}: truth"] = digest(unknown.truth.tobytes())
+            parts[f"parameter {key}: truth"] = _moments(unknown.truth) if gallery else digest(unknown.truth.tobytes())
     parts = {part: text if len(text) <= _LONGEST_PART else digest(text.encode()) for part, text in parts.items()}
     begun = any((run / RECORD).is_file() for run in folder.glob(RUN_FOLDERS))
     if begun and record.definition and (changes := differences(record.definition, parts)):
         what = f"its problem has changed since trial 0: {shortened(changes)}"
         raise InputError(f"sweep {folder}: {what}; begin another sweep, or take the change back")
     return parts
+
+
+def _moments(values: np.ndarray) -> str:
+    """Return shape, mean and standard deviation of values that a gallery problem computes: their last digits depend on the machine."""
+    return f"{values.shape} of mean {values.mean(dtype=float):.4g} and deviation {values.std(dtype=float):.4g}"
 
 
 def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:

@@ -125,7 +125,7 @@ class SweepRecord(BaseModel):
 
     Attributes:
         status: "running", "finished" or "interrupted".
-        definition: {part of the problem: its text or hash} when the first trial started; empty for problems without a file.
+        definition: {part of the problem: its text or hash} when the first trial started; empty in sweeps of earlier versions.
         best: number of the finished trial with the least error; None before a trial has finished.
         best_line: the settings of that trial, as they are typed; "" before a trial has finished.
         wall_seconds: duration of all sessions so far.
