@@ -187,6 +187,7 @@ def test_a_callback_may_add_arrays_to_the_history_and_return_nothing(tmp_path: P
     assert (record["psnr"], record["sizes"], record["thing"]) == (1.5, [1.0, None], repr(Path))
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("folder", ["", 5, None])
 def test_what_is_no_folder_is_refused(folder: Any) -> None:
     def run(**of: Any) -> ur.Result:

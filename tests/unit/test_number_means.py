@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ from tests.analytic import AnalyticRenderer
 from unrender.optimizers import Adam, AveragedNewton, Partitioned
 from unrender.optimizers.base import Measuring, averaged_by
 from unrender.runs import number_means, verify
+from unrender.runs.map_uncertainty import uncertainty
+from unrender.runs.notebook import html
 from unrender.runs.number_means import NumberTrace
+from unrender.runs.optimize import _with_reasons
 
 TRUTH = {"gain": np.array([0.5, 0.3], np.float32)}
 SEEDS = range(12)
@@ -49,6 +53,22 @@ def test_a_run_that_has_not_arrived_keeps_its_last_values() -> None:
     assert result.parameters is result.last
     assert not result.standard_error
     assert not result.adapted
+
+
+@pytest.mark.mitsuba
+def test_a_run_without_a_folder_says_how_numbers_get_standard_errors(tmp_path: Path) -> None:
+    result = ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.02), steps=3)
+    (line,) = result.without_errors
+    assert line.startswith(
+        "gain: no standard errors: unrender.runs.uncertainty(problem, result) computes them, or says why"
+    )
+    assert line in html(result)
+    known = uncertainty(problem(), result)
+    assert known.standard_error.keys() | {line.partition(":")[0] for line in known.missing} >= {"gain"}
+    (line,) = _with_reasons(replace(result, misfit=cast(Any, "differs"))).without_errors
+    assert line == "gain: no standard errors: the final picture differs from the references by more than noise"
+    kept = ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.02), steps=3, run_directory=tmp_path / "run")
+    assert not any("uncertainty(" in line for line in kept.without_errors)
 
 
 def test_a_number_that_drifts_leaves_the_others_without_errors() -> None:
@@ -99,6 +119,7 @@ def test_short_means_beside_control_variates_have_no_standard_errors() -> None:
     assert with_errors(ur.images.RecursiveControlVariate(), 300, 2)
 
 
+@pytest.mark.mitsuba
 def test_means_of_a_resumed_run_are_those_of_one_run(tmp_path: Path) -> None:
     whole = run(steps=120)
     run(steps=70, run_directory=tmp_path / "run")

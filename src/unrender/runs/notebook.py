@@ -111,6 +111,7 @@ def html(result: Result) -> str:
         notebook.charts(charts),
         notebook.facts({name: text for name, text in rows.items() if text}),
         notebook.lines(result.warnings, "warning: "),
+        notebook.lines(result.without_errors, ""),
     )
 
 

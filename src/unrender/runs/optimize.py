@@ -100,7 +100,7 @@ def optimize(
     run.description, run.initial = describe_run(run, annotations), first_values(run)
     folder = _folder(run, annotations, run_directory, checkpoint_every)
     with _progress(progress) as bar, folder as writers, connected(run, [*bar, *callbacks], writers, annotations.phases):
-        return descend(run)
+        return descend(run) if writers else _with_reasons(descend(run))
 
 
 def _check_kinds(problem: Any, callbacks: Any, annotations: Any, progress: Any) -> None:
@@ -110,6 +110,15 @@ def _check_kinds(problem: Any, callbacks: Any, annotations: Any, progress: Any) 
     checks.optional("optimize: annotations", annotations, RunAnnotations, "a RunAnnotations")
     if progress is not None:
         checks.flag("optimize", "progress", progress)
+
+
+def _with_reasons(result: Result) -> Result:
+    """Add a line for each unknown without standard errors to the result of a run without a run folder."""
+    why = "unrender.runs.uncertainty(problem, result) computes them, or says why not, as a run with a run folder does"
+    if result.misfit is not None:
+        why = "the final picture differs from the references by more than noise"
+    lines = (f"{key}: no standard errors: {why}" for key in result.parameters if key not in result.standard_error)
+    return replace(result, without_errors=tuple(lines))
 
 
 @contextmanager

@@ -64,7 +64,8 @@ class Result:
             warning says so. Textures of runs with a run folder have a map, see `unrender.runs.uncertainty`.
         data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
-        without_errors: one line for each texture or grid without a map of standard errors: the reason. Empty for runs without a run folder.
+        without_errors: one line for each texture or grid without a map of standard errors: the reason. Without a run folder, one for each
+            unknown without standard errors.
         phases: {phase: seconds} in order: on the command line, earlier phases such as loading; then "compiling", "steps", "checkpoints
             and callbacks", "verification", "final pictures". For a resumed run, those of the last session.
         sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over
