@@ -35,6 +35,23 @@ def test_auto_finds_the_right_values(name: str) -> None:
         assert np.linalg.norm(error) < 0.05
 
 
+def test_a_meter_of_one_pixel_has_enough_samples() -> None:
+    """Steps had 256 paths in all: the lamp's radiance rose from 3 to a loss of 190 times the first one, or stayed at its start."""
+    key, face = "lamp.emitter.radiance.value", mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    above = mi.ScalarTransform4f().translate([0.5, 2.0, 0.0]).rotate([1, 0, 0], 90).scale(0.5)
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    scene = {
+        "type": "scene",
+        "plate": {"type": "rectangle", "to_world": face, "meter": {"type": "irradiancemeter", "film": film}},
+        "lamp": {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": rgb(12.0, 11.0, 9.0)}},
+    }
+    made = ur.Problem(scene, [ur.Parameter(key, initial=3.0)], [ur.View(np.zeros((1, 1, 3)))], max_depth=2)
+    reference = ur.render(made, {key: np.array([12.0, 11.0, 9.0])}, 0, spp=1 << 18, seed=9)
+    result = ur.optimize(made.replaced(views=[ur.View(reference)]), steps=12, progress=False)
+    assert result.status == "finished"
+    np.testing.assert_allclose(result.parameters[key], [12.0, 11.0, 9.0], rtol=0.05)
+
+
 @pytest.mark.slow
 def test_a_metal_that_starts_without_absorption_gets_its_own() -> None:
     """k = 0 is a second minimum where η < 1, since metals reflect nearly all light there: red ended at 0.0085 ± 0.0074 in silence."""

@@ -384,11 +384,11 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
     plan = method("auto").plan(made)
-    samples = CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1]
+    samples = 4 * CONSTANTS.number_spp[1], 4 * CONSTANTS.difference_spp[1]  # 16 pixels have the paths of 64
     expected = GaussNewton(*samples, noise_limit=CONSTANTS.noise_limit, remember=True)
     assert plan.estimator == expected
     constants(monkeypatch, number_paths=0, number_spp=(4, 1 << 20))  # as on a large film
-    renders = 2 * 4 * CONSTANTS.difference_spp[1]
+    renders = 2 * 4 * samples[1]
     assert chosen(made)[0].spp == cost(renders * made.pixels, 16) // made.pixels, "an image takes less than differences"
     constants(monkeypatch)
     lit = {key: dataclasses.replace(info, nonlinear=True, brightness="light") for key, info in known.items()}
@@ -504,7 +504,7 @@ def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(m
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
     estimator, optimizer = chosen(problem())
-    spp = CONSTANTS.image_spp[1]
+    spp = 4 * CONSTANTS.image_spp[1]  # 16 pixels have the paths of 64
     largest: dict[str, float] = dict.fromkeys(("map", "gain"), 0.2 * CONSTANTS.pose_reach)
     assert estimator == GaussNewton(spp, spp // CONSTANTS.per_derivative, largest=largest)
     assert isinstance(optimizer, optimizers.AveragedNewton)

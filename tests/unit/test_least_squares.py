@@ -343,6 +343,18 @@ def test_fewer_values_than_numbers_leave_all_open():
     assert "a least-squares test at the end does not determine it" in found.undetermined["a"]
 
 
+def test_as_many_values_as_numbers_are_determined_without_errors():
+    """A meter of one pixel said that it does not determine the three values of a light, since no residual tells its noise."""
+    truth = {"a": np.array([0.3, -0.2, 0.5])}
+    renderer = AnalyticRenderer(truth, MATRIX[:3, :3], 2.0, 0.001, shape=(1, 1))
+    view = ur.View(renderer.exact(truth).astype(np.float32))
+    made = ur.Problem(renderer, [ur.Parameter("a", initial=0.5 * truth["a"])], [view])
+    found = check_numbers(made, truth, made.initial_values(), FAR)
+    assert not found.undetermined
+    assert not found.errors
+    assert "as few values as these numbers" in found.missing()[0]
+
+
 def test_numbers_of_any_scale():
     """Pictures that are 1e4 times as bright or dark, and parameters in other units."""
     for brightness, units in ((1e4, 1.0), (1e-4, 1.0), (1.0, 1e-4), (1.0, 1e4)):

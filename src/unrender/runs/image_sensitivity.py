@@ -19,7 +19,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, check_problem, selected_views, view_request
+from unrender.scene.render import as_tree, check_problem, limited_spp, selected_views, view_request
 from unrender.statistics.debiased import overlap
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
@@ -289,8 +289,8 @@ def seen_elements(values: np.ndarray) -> np.ndarray:
 
 
 def adjoint_spp(problem: Problem) -> int:
-    """Return the samples per pixel of an adjoint: 4, or fewer if the views have more than 2¹⁸ pixels in total."""
-    return min(max(_PATHS // problem.pixels, 1), _MOST_SPP)
+    """Return the samples per pixel of an adjoint: 4, or fewer if the views have more than 2¹⁸ pixels in total, or more below 64."""
+    return limited_spp(_PATHS, problem.pixels, (1, _MOST_SPP))
 
 
 def derivative_session(problem: Problem) -> tuple[RenderSession | None, frozenset[str]]:

@@ -368,8 +368,11 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
 
 
 def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, refuted: bool) -> str:
-    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,), or about a difference that
-    no numbers explain; "" for none. Where numbers have not settled, or are `refuted`, their pictures may differ as if so."""
+    """Return a line about a distortion of a reference that would move numbers by several standard errors (n,), about a difference that no
+    numbers explain, or about pictures with as many values as numbers; "" for none. Where numbers have not settled, or are `refuted`, their
+    pictures may differ as if so."""
+    if numbers.references().size == numbers.count:  # a fit leaves no residual, which tells the references' noise
+        return f"{listed(numbers.keys)}: no standard errors: the pictures have as few values as these numbers; add pixels or views"
     line = f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references "
     # What a step leaves of the pictures may be its curvature, however small a part of the number's range it is.
     unsettled = refuted or bool((np.abs(fit.step) > _STEP_ERRORS * of_step).any())

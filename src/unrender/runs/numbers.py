@@ -14,7 +14,7 @@ from unrender.core.text import listed
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.runs.image_sensitivity import ADJOINT, adjoint_spp, mask_roots
 from unrender.scene.problem import Problem
-from unrender.scene.render import power_of_two, selected_views
+from unrender.scene.render import limited_spp, power_of_two, selected_views
 from unrender.statistics.paired_losses import slices_of_images
 
 MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
@@ -150,7 +150,7 @@ class Numbers:
             sizes += [size] * values[key].size
             limits += [limit] * values[key].size
         rigid = np.concatenate([np.full(values[key].size, known[key].rigid) for key in keys])
-        spp = min(max(_PATHS // (2 * elements * pixels), _SPP[0]), _SPP[1])
+        spp = limited_spp(_PATHS // (2 * elements), pixels, _SPP)
         point, began = (np.concatenate([np.ravel(x[key]).astype(np.float64) for key in keys]) for x in (values, start))
         return cls(
             problem, values, tuple(keys), tuple(views), point, began, np.array(sizes), np.array(limits), rigid,

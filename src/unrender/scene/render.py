@@ -69,6 +69,16 @@ def render(
     return (total / spp).astype(np.float32)
 
 
+_FEW_PIXELS = 64  # below, starting a render takes longer than its paths
+
+
+def limited_spp(paths: int, pixels: int, limits: tuple[int, int]) -> int:
+    """Return the samples per pixel of a path budget, within limits; fewer than 64 pixels, such as those of meters, have up to as many paths
+    as 64."""
+    low, high = limits
+    return min(max(paths // pixels, low), high * max(_FEW_PIXELS // pixels, 1))
+
+
 def power_of_two(number: int) -> int:
     """Return the largest power of two <= `number`, at least 1. Few different sample counts need few different kernels."""
     return 1 << (max(number, 1).bit_length() - 1)

@@ -32,6 +32,7 @@ from unrender.optimizers.partitioned import Partitioned, Successive
 from unrender.optimizers.recipes import Adam
 from unrender.scene.executor import LocalExecutor
 from unrender.scene.problem import Problem
+from unrender.scene.render import limited_spp
 from unrender.schedules import Exponential
 from unrender.statistics.scores import positive_inverse
 
@@ -45,7 +46,7 @@ def cameras(traits: Traits) -> Plan | None:
     of_cameras = traits.only_cameras or traits.cameras_and_lenses
     if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
         return None
-    spp = traits.options.spp or within(constants.image_spp, constants.image_paths // problem.pixels)
+    spp = traits.options.spp or limited_spp(constants.image_paths, problem.pixels, constants.image_spp)
     spp, derivative_spp = max(spp, 2), max(spp // constants.per_derivative, constants.fewest_derivative)
     reason = f"Gauss-Newton steps for cameras from perturbed renders {_samples(spp, derivative_spp)}; the mean of all steps' models"
     widths = widths_of(traits.options.sigma, problem, traits.poses)
@@ -94,9 +95,8 @@ def few_numbers(traits: Traits) -> Plan | None:
     estimator = _by_channel(traits, estimator)
     plateau = False
     if traits.poses:
-        trial = replace(
-            estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False, scores=False
-        )
+        spp = limited_spp(constants.number_paths, problem.pixels, (constants.trial_spp, constants.trial_spp))
+        trial = replace(estimator, derivative_spp=spp, coarse=None, noise_limit=None, remember=False, scores=False)
         trial = replace(trial, largest=widths_of(traits.options.sigma, problem, traits.poses))
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear:
@@ -167,8 +167,8 @@ def then_newton(traits: Traits, plan: Plan) -> Plan:
         return plan
     newton = replace(
         _estimator(traits, keys, 0.0),
-        spp=max(traits.options.spp or within(constants.number_spp, constants.number_paths // problem.pixels), 2),
-        derivative_spp=within(constants.difference_spp, constants.number_paths // (traits.elements * problem.pixels)),
+        spp=max(traits.options.spp or limited_spp(constants.number_paths, problem.pixels, constants.number_spp), 2),
+        derivative_spp=limited_spp(constants.number_paths // traits.elements, problem.pixels, constants.difference_spp),
         remember=True,
         derivative_noise=constants.derivative_noise,
     )
@@ -284,12 +284,12 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     fewest, most = constants.difference_spp
     if images >= 1.0 and moved and not poses and len(moved) == len(keys):  # all differences of a view share a launch
         most = max(most, LAUNCH * len(problem.views) // (elements * problem.pixels))
-    differences = within((fewest, most), constants.difference_paths // (2 * elements * problem.pixels))
+    differences = limited_spp(constants.difference_paths // (2 * elements), problem.pixels, (fewest, most))
     renders, least = 2 * elements * differences * problem.pixels, constants.block_paths
     if images >= 1.0:  # no block: states that differ in poses only are rendered together
         renders, least = cost(renders, 4 if len(moved) == len(keys) else 4 * elements), constants.number_paths
-    paths = max(least, round(renders * images)) // problem.pixels
-    spp = traits.options.spp or within(constants.number_spp, paths)
+    paths = max(least, round(renders * images))
+    spp = traits.options.spp or limited_spp(paths, problem.pixels, constants.number_spp)
     side = min(min(size) for size in problem.sizes)
     reach = constants.pose_reach if poses else constants.light_reach
     shift = constants.camera_shift if any(traits.infos[key].viewpoint for key in poses) else constants.pose_shift
