@@ -151,6 +151,13 @@ def _surface_of(key: str) -> str:
     return _SLOT.split(key, maxsplit=1)[0] if _SLOT.search(key) else key.rsplit(".", 2)[0]
 
 
+def shares_surface(problem: Problem, key: str) -> bool:
+    """Return whether another unknown texture or mesh attribute has the same surface as that of the key."""
+    infos = problem.renderer.parameters()
+    lists = (k for k, shape in problem.shapes().items() if math.prod(shape) > 3 and not infos[k].welded and k != key)
+    return any(_surface_of(other) == _surface_of(key) for other in lists)
+
+
 def _surfaces(problem: Problem) -> Iterator[list[str]]:
     """Yield the keys of the textures of each surface whose changes may hide one another; none for many views."""
     known = problem.renderer.parameters()

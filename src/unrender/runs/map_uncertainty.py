@@ -99,9 +99,9 @@ def uncertainty(
     (1 − f²) / 16, the means of 4 × 4 texels count as followed. The variance Σ of a pixel is that of the residual that neighbouring
     pixels do not share. τ² is the mean square change from the start plus the mean variance, and p the curvature of the parameter's prior.
 
-    The root mean square of error / se is 0.76 to 1.68 on ten textures, and largest after many steps and for large H. Errors of what is not
-    unknown, such as a lamp's colour, are not included. Volumes have no map: rays pass many voxels. Nor have textures with κ ≥ 1.5, such as
-    those with more texels than pixels, or of which the picture is no linear function, or any if time or samples are too few.
+    The root mean square of error / se is 0.76 to 1.68 on ten textures, and largest after many steps and for large H. Errors by a wrong lamp
+    or by other textures of the surface are not included. Volumes have no map: rays pass many voxels. Nor have textures with κ ≥ 1.5, such
+    as those with more texels than pixels, or of which the picture is no linear function, or any if time or samples are too few.
 
     Args:
         problem: problem with views and scene.

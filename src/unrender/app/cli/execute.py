@@ -20,6 +20,7 @@ from unrender.runs import watches
 from unrender.runs.callbacks import RUN_PHASES
 from unrender.runs.final_checks import image_name
 from unrender.runs.image_sensitivity import seen_cells
+from unrender.runs.joint_maps import shares_surface
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.progress import Progress
@@ -125,14 +126,18 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
     )
 
 
-def _map_line(error: np.ndarray, share: np.ndarray) -> str:
-    """Return the standard error of a texture or grid where the references decided it, and how much of it that is."""
+def _map_line(error: np.ndarray, share: np.ndarray, alone: bool) -> str:
+    """Return the standard error of a texture or grid where the references decided it, and how much of it that is.
+
+    It does not contain errors of other unknown textures of the surface. `alone` says that there are none.
+    """
     decided = share >= 0.5
     if not decided.any():
         return "decided by the start, by smoothing or by a prior, not by the references"
     median = formatting.number(float(np.median(error[decided])))
     where = f"where the references decided the values, {decided.mean():.0%} of all"
-    return f"{median} (median standard error, right to a factor of 1.7, {where})"
+    others = "" if alone else " if the other textures of its surface are right"
+    return f"{median} (median standard error, right to a factor of 1.7{others}, {where})"
 
 
 def verified(result: Result) -> str:
@@ -181,7 +186,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         table.add_row(escape(key), _error_line(problem, result, key, start[key], error))
     for key, error in result.standard_error.items():
         if key in result.data_share:
-            table.add_row(f"± {escape(key)}", _map_line(error, result.data_share[key]))
+            alone = not shares_surface(problem, key)
+            table.add_row(f"± {escape(key)}", _map_line(error, result.data_share[key], alone))
         elif key not in few:
             table.add_row(
                 f"± {escape(key)}", f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)"
