@@ -75,6 +75,7 @@ MISTAKES = [
     (["run", "problem.toml", "--out", "problem.toml/run"], "--out problem.toml/run: Not a directory"),
     (["run", "problem.toml", "--out", "."], "--out .: the folder is not empty and holds no earlier results"),
     (["run", "problem.toml", "--out", ".", "--overwrite"], "--out .: the folder is not empty"),
+    (["methods", ""], "unknown method ; there are auto, plain"),
     (["methods", "plian"], "unknown method plian; did you mean plain?"),
     (["gallery", "indirect-rooms"], "did you mean indirect-room?"),
     (["report", "nowhere"], "nowhere"),
@@ -162,6 +163,12 @@ def test_mistakes_are_one_line(unrender, problem: Path, words: list[str], messag
     before = sorted(problem.parent.rglob("*"))
     check(unrender(*words), message)
     assert sorted(problem.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("words", [["watch", "loop"], ["import", ".", "--out", "loop"]])
+def test_links_in_a_circle_are_one_line(unrender, problem: Path, words: list[str]) -> None:
+    (problem.parent / "loop").symlink_to("loop")
+    check(unrender(*words), "loop")
 
 
 # How to spoil the files of a problem, and what the line says.

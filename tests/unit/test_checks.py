@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -174,3 +175,45 @@ def test_components_of_another_kind_are_refused_by_name(made: Callable[[Any], An
     with pytest.raises(InputError) as error:
         made("rcv")
     assert str(error.value) == expected
+
+
+_WRONG: list[Any] = [3, [1, "a"], {1: 2}, object(), int, np.zeros(3), b"x", {1}, 10**400, "a\0b", "x" * 5000]
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(
+    ("call", "but"),
+    [
+        (lambda x: ur.app.ImportOptions(mesh=x), "x"),
+        (lambda x: ur.app.ImportOptions(unknowns=x), ""),
+        (lambda x: ur.app.ImportOptions(response=x), "3"),
+        (lambda x: ur.app.import_capture(x, "out"), ""),
+        (lambda x: ur.app.import_capture("nowhere", x), ""),
+        (lambda x: ur.app.import_capture("nowhere", "out", x), ""),
+        (lambda x: ur.app.export(x, "out"), ""),
+        (lambda x: ur.app.export("nowhere", "out", formats=x), ""),
+        (lambda x: ur.app.judge(x), ""),
+        (lambda x: ur.app.judge("nowhere", out=x), ""),
+        (lambda x: ur.app.sweep(x, steps=1, over={"learning_rate": "1,2"}, out="out"), ""),
+        (lambda x: ur.app.sweep("exponential", settings=x, steps=1, over={"learning_rate": "1,2"}, out="out"), ""),
+        (lambda x: ur.app.sweep("exponential", steps=x, over={"learning_rate": "1,2"}, out="out"), "3"),
+        (lambda x: ur.app.sweep("exponential", seconds=x, over={"learning_rate": "1,2"}, out="out"), "3"),
+        (lambda x: ur.app.turntable("nowhere", "a.mp4", rate=x), ""),
+        (lambda x: ur.app.turntable("nowhere", "a.mp4", elevation=x), ""),
+        (lambda x: ur.app.turntable("nowhere", "a.mp4", background=x), ""),
+        (lambda x: ur.app.turntable("nowhere", "a.mp4", up=x), ""),
+        (lambda x: ur.gallery.photographs(x), "x"),
+        (lambda x: ur.smoothed.gradient(lambda points: points[:, 0], x, 0.1, 16), "array"),
+    ],
+)
+def test_arguments_of_another_kind_are_one_line(
+    call: Callable[[Any], Any], but: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They ended in an AttributeError, a TypeError or an OSError. `but` begins the words of values that are right."""
+    monkeypatch.chdir(tmp_path)
+    for value in _WRONG:
+        if but and (repr(value).strip("'")[:1] == but or repr(value).startswith(but)):
+            continue
+        with pytest.raises(InputError) as error:
+            call(value)
+        assert len(str(error.value).splitlines()) == 1

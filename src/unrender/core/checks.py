@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import inspect
 import logging
@@ -61,10 +62,15 @@ def real(value: Any) -> float:
 
 
 def path(where: str, value: Any, what: str = "a folder") -> Path:
-    """Return the path of a file or folder, else raise `InputError`. "" would be the current folder."""
-    if isinstance(value, (str, os.PathLike)) and value != "" and "\0" not in os.fspath(value):
-        return Path(value)
-    raise InputError(f"{where}: expected {what}, got {in_words(value)}")
+    """Return the path of a file or folder, else raise `InputError`, also for a name that is too long. "" would be the current folder."""
+    if not isinstance(value, (str, os.PathLike)) or value == "" or "\0" in os.fspath(value):
+        raise InputError(f"{where}: expected {what}, got {in_words(value)}")
+    try:
+        os.lstat(value)
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{where}: {in_words(value)}: {error.strerror}") from error
+    return Path(value)
 
 
 def optional(where: str, value: Any, kind: type, what: str) -> None:

@@ -129,7 +129,7 @@ def did_you_mean(name: Any, known: Iterable[str], likeness: float = 0.6) -> str:
     """
     if not isinstance(name, str) or len(name) > _LONGEST:
         return ""
-    names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
+    names = [each for each in itertools.islice(known, _MOST) if isinstance(each, str) and len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]
     synonyms = [each for each in _SYNONYMS.get(name.lower(), ()) if each in names]
     swaps = {name[:i] + name[i + 1] + name[i] + name[i + 2 :] for i in range(len(name) - 1)}

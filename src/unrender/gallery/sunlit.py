@@ -151,7 +151,7 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
     """
     for name, value, least in (("views", views, 3), ("size", size, 8), ("spp", spp, 1), ("seed", seed, 0)):
         checks.integer("photographs", name, value, at_least=least)
-    out = Path(folder)
+    out = checks.path("photographs: folder", folder)
     files.check_replaceable(out, (), "transforms.json", False, f"photographs: {out}", "photographs")
     variant.ensure()
     sky = parts.environment(parts.picture(SUN, 0.3, (14.0, 12.5, 10.5)))  # a veiled sun, for soft shadows

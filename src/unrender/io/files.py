@@ -247,9 +247,9 @@ def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None
 
     A folder that was moved away for a replacement that did not happen is restored. Files of other live processes are not touched.
     """
-    if folder.is_symlink():
-        return
     with contextlib.suppress(OSError):
+        if folder.is_symlink():
+            return
         for path in sorted(folder.iterdir()):
             match = _TEMPORARY.fullmatch(path.name)
             if match is None or (names is not None and match[1] not in names):

@@ -163,8 +163,8 @@ def _age(path: Path | None) -> int:
     """Return the modification time of a file, which invalidates the cache when it changes."""
     try:
         return 0 if path is None else path.stat().st_mtime_ns
-    except OSError as error:
-        raise InputError(f"Perceptual: weights {path}: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise InputError(f"Perceptual: weights {path}: {getattr(error, 'strerror', None) or error}") from error
 
 
 @functools.lru_cache(maxsize=4)

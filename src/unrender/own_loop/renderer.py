@@ -268,14 +268,14 @@ class Renderer:
         A renderer with the same options that loads it continues as this one would, bit for bit where sums have a fixed order (see
         `optimize`).
         """
-        return write_state(Path(path), self.state, self._options.describe())
+        return write_state(checks.path("Renderer.save", path, "a file"), self.state, self._options.describe())
 
     def load(self, path: str | Path) -> None:
         """Continue from a state that `save` wrote, with its step and seed.
 
         Raises `InputError` for a damaged file, or one with other options.
         """
-        loaded = read_state(Path(path), self._options.describe(), self.state)
+        loaded = read_state(checks.path("Renderer.load", path, "a file"), self._options.describe(), self.state)
         streams = {name: self._stream(name) for name in loaded.streams}
         for name, stream in streams.items():
             stream.state = loaded.streams[name]

@@ -146,7 +146,7 @@ def curvature(
     maps = [key for key, square in squares.items() if square.ndim >= MAP_AXES]
     stored: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
     most = min(_PROBES, _PROJECTIONS // max(1, sum(squares[key].size for key in maps)))
-    made, until = 0, timing.now() + seconds
+    made, until = 0, timing.now() + checks.real(seconds)
     while made == 0 or (made < probes and timing.now() < until):
         try:
             one, other = (

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from unrender.backend.variant import current
 from unrender.backend.versions import hardware, versions
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.io.resampling import reduced, resize_nearest
@@ -61,7 +61,7 @@ class Live(Callback):
     """
 
     def __init__(self, folder: str | Path, name: str = "", method: str = "", command: str = ""):
-        self._folder = Path(folder)
+        self._folder = checks.path("Live: folder", folder)
         self._name, self._method, self._command_line = name, method, command
         self._history = _LiveHistory(self._folder)
         self._disabled = False

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unrender.core import timing
+from unrender.core import checks, timing
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
@@ -116,8 +116,8 @@ def uncertainty(
         InputError: `values` have other keys or shapes than the problem's, or are not finite.
     """
     values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
-    check_arguments("uncertainty", problem, values or {}, seconds, seed)
-    known, maps, ends, until = Curvature(), Uncertainty(), {}, timing.now() + seconds
+    check_arguments("uncertainty", problem, {} if values is None else values, seconds, seed)
+    known, maps, ends, until = Curvature(), Uncertainty(), {}, timing.now() + checks.real(seconds)
     keys, mapped = checked_keys(problem, values, problem.initial_values()), map_keys(problem)
     if mapped or keys:
         views = range(len(problem.views)) if mapped else selected_views(problem)

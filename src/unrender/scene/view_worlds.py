@@ -86,7 +86,10 @@ def _turned(renderer: Renderer, views: Sequence[View], keys: Sequence[str]) -> t
             check_sensor(index, view, count)
     if not isinstance(own, TurnsLights):
         return renderer, []
-    alike = all(view.scene is None and view.aov is None and isinstance(view.known or {}, Mapping) for view in views)
+    alike = all(
+        view.scene is None and view.aov is None and isinstance({} if view.known is None else view.known, Mapping)
+        for view in views
+    )
     layer = expression_layer(renderer)
     used = [*keys, *(() if layer is None else (one.key for one in layer.expressions))]
     found = turns_of(own, count, [(view.sensor, view.known or {}) for view in views], used) if alike else None

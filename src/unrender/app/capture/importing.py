@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -34,7 +35,7 @@ from unrender.backend import variant
 from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.core.text import printable
+from unrender.core.text import in_words, printable
 from unrender.display.pictures import png
 from unrender.io import files
 
@@ -104,9 +105,11 @@ class ImportOptions:
     def __post_init__(self) -> None:
         for name in ("mesh", "masks"):
             value = getattr(self, name)
-            object.__setattr__(self, name, None if value is None else Path(value))
+            object.__setattr__(self, name, None if value is None else checks.path(f"import: {name}", value, "a file"))
         pictures.check_response(self.response)
         if self.unknowns is not None:
+            if not isinstance(self.unknowns, (list, tuple)) or not all(isinstance(name, str) for name in self.unknowns):
+                raise InputError(f"import: unknowns must be a list of names, got {in_words(self.unknowns)}")
             object.__setattr__(self, "unknowns", self.chosen(()))
         for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
             checks.integer("import", name, getattr(self, name), at_least=least)
@@ -181,7 +184,8 @@ def import_capture(
     Raises:
         InputError: a malformed file, with the expected content, or an option that would be ignored; nothing is written then.
     """
-    folder, out = Path(folder), Path(out)
+    folder, out = checks.path("import_capture: folder", folder), checks.path("import_capture: out", out)
+    checks.optional("import_capture: options", options, ImportOptions, "an ImportOptions")
     options = options or ImportOptions()
     if not overwrite and out.is_dir() and any(out.iterdir()):
         raise InputError(f"import_capture: {out}: not empty; give overwrite=True to replace an earlier import")
@@ -300,11 +304,11 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
 
 def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str]) -> None:
     """Raise `InputError` if replacing `out` would remove other files than `own`, those of an earlier import or check."""
-    place = out.resolve()
+    place = os.path.realpath(out)  # `Path.resolve` raises RuntimeError for links in a circle
     if out.name in ("", "..") or Path.cwd().is_relative_to(place):
         raise InputError(f"--out {out}: the current directory or one above it; expected a folder to be made")
     for what, needed in (("FOLDER", folder), ("--masks", options.masks)):
-        if needed is not None and needed.resolve().is_relative_to(place):
+        if needed is not None and Path(os.path.realpath(needed)).is_relative_to(place):
             raise InputError(f"--out {out}: {what} {needed} is inside it and would be removed; give a new folder")
     with files.input_errors(f"--out {out}"):
         others = sorted({path.name for path in out.iterdir()} - own) if out.is_dir() else []

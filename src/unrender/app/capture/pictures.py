@@ -282,7 +282,7 @@ _LEAST, _MOST = 1.0, 4.0  # Range of exponents. Those of cameras and screens are
 
 def check_response(response: str) -> str:
     """Return a response unchanged. Raise `InputError` if it is neither a name nor an exponent from 1 to 4."""
-    if response not in (SRGB, LINEAR, FIT):
+    if not isinstance(response, str) or response not in (SRGB, LINEAR, FIT):
         _exponent(response)
     return response
 
@@ -299,7 +299,9 @@ def decode(levels: np.ndarray, response: str) -> np.ndarray:
 
 def _exponent(text: str) -> float:
     names = f"{SRGB}, {LINEAR}, {FIT} or an exponent from {_LEAST:g} to {_MOST:g}, such as 2.2"
-    expected = f"--response {printable(text[:40])}: expected {names}"
+    expected = f"--response {printable(text)}: expected {names}"
+    if not isinstance(text, str):
+        raise InputError(expected)
     try:
         exponent = float(text)
     except ValueError as error:

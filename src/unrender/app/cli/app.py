@@ -101,7 +101,7 @@ def methods(
     from unrender.methods import methods as registered
 
     console = Console(highlight=False)
-    for one in [method(name)] if name else registered().values():
+    for one in [method(name)] if name is not None else registered().values():
         console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
         console.print(_method_options(one))
         console.print()

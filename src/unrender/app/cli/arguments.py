@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 from collections.abc import Collection, Iterable, Mapping
+from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from unrender.backend import cache, variant
-from unrender.core import lazy, phases, registry
+from unrender.core import checks, lazy, phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import LARGEST_SEED
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.io import confinement
 
 if TYPE_CHECKING:
@@ -280,15 +281,15 @@ def absolute(problem: str) -> str:
 
 
 def _is_file(name: str) -> bool:
-    return Path(name).suffix.lower() in (".toml", ".xml") or Path(name).is_file()
+    return Path(name).suffix.lower() in (".toml", ".xml") or bounded_files.kind(Path(name)) == "file"
 
 
 def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
     """Return steps and seconds; `DEFAULT_STEPS` steps if both are None. Raise `InputError` for an invalid value."""
-    if steps is not None and not 1 <= steps < 1 << 63:
-        raise InputError(f"--steps {steps!s:.60}: expected at least 1 and less than 2**63")
-    if seconds is not None and not 0 < seconds < math.inf:
-        raise InputError(f"--seconds {seconds:g}: expected a number above 0")
+    if steps is not None and not (isinstance(steps, Integral) and 1 <= steps < 1 << 63):
+        raise InputError(f"--steps {in_words(steps)}: expected at least 1 and less than 2**63")
+    if seconds is not None and not 0 < checks.real(seconds) < math.inf:
+        raise InputError(f"--seconds {in_words(seconds).removesuffix('.0')}: expected a number above 0")
     return (DEFAULT_STEPS if steps is None and seconds is None else steps), seconds
 
 

@@ -239,12 +239,13 @@ def watch(
     from unrender.app.stages import stages_file
     from unrender.app.sweeps.record import watched_folders
     from unrender.app.watch import server
+    from unrender.io import bounded_files
 
+    for directory in directories:
+        if bounded_files.kind(directory) not in ("", "folder"):
+            raise InputError(f"{directory}: a file, expected a run folder")
     staged = [stage for directory in directories for stage in stages_file.run_folders(directory)]
     directories = [run for stage in staged for run in watched_folders(stage)]
-    for directory in directories:
-        if directory.exists() and not directory.is_dir():
-            raise InputError(f"{directory}: a file, expected a run folder")
     if len({directory.resolve() for directory in directories}) < len(directories):
         raise InputError("watch: a run folder is listed twice")
     for directory in directories:

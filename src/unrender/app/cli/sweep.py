@@ -10,7 +10,7 @@ import typer
 
 from unrender.app.cli import arguments
 from unrender.app.cli.signals import DOUBTFUL, FAILED
-from unrender.core import phases, registry
+from unrender.core import checks, phases, registry
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 from unrender.core.text import did_you_mean
@@ -168,7 +168,8 @@ def sweep(
     }  # fmt: skip
     where = arguments.workers(None if workers is None else str(workers), insecure)
     planned = _planned(
-        values | {"settings": _texts(settings), "problem_settings": _texts(problem_settings)}, over or {}
+        values | {"settings": _texts(settings), "problem_settings": _texts(problem_settings)},
+        {} if over is None else over,
     )
     return _run_silently(planned, where, threads, _folder(planned, None if out is None else Path(out), overwrite))
 
@@ -193,6 +194,7 @@ def _run_silently(
 def _texts(values: Mapping[str, Any] | None) -> dict[str, str]:
     from unrender.app.sweeps.search import as_text
 
+    checks.optional("sweep: settings", values, Mapping, "values by name")
     return {name: as_text(value) for name, value in (values or {}).items()}
 
 

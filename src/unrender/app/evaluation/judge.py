@@ -105,11 +105,12 @@ def judge(
     variant.ensure()
     spp = checks.integer("judge", "spp", spp, at_least=1)
     run = checks.path("judge: run", run, "a run folder")
-    place = run / "judge" if out is None else Path(out)
+    place = run / "judge" if out is None else checks.path("judge: out", out)
     files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
-    light = None if environment is None else scenes.read_light(Path(environment))
+    light = None if environment is None else scenes.read_light(checks.path("judge: environment", environment, "a file"))
     problem, result = reopen.problem_of(run), folders.read(run)
-    held_out_file = scenes.find(run, problem) if held_out is None else Path(held_out)
+    given = "judge: held_out", held_out, "a file"
+    held_out_file = scenes.find(run, problem) if held_out is None else checks.path(*given)
     values, truth = _recovered(run, problem, result)
     of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
     target, values, notices = _problem(problem, held_out_file, values, result)

@@ -20,6 +20,7 @@ from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.geometry import rotation
+from unrender.core.text import in_words, printable
 from unrender.display.pictures import quantized
 from unrender.io import files
 from unrender.losses.metrics import exposure, srgb
@@ -133,22 +134,27 @@ def _opened(run: str | Path, notify: Callable[[str], None] | None) -> tuple[Prob
 
 def _check(frames: int, rate: float, size: int, spp: int, elevation: float, background: str) -> None:
     if not isinstance(frames, int) or not 1 <= frames <= _MOST_FRAMES:
-        raise InputError(f"--frames {frames}: expected 1 to {_MOST_FRAMES}")
-    if not 0 < rate <= 240:
-        raise InputError(f"--rate {rate:g}: expected above 0 and at most 240")
+        raise InputError(f"--frames {in_words(frames)}: expected 1 to {_MOST_FRAMES}")
+    if not 0 < checks.real(rate) <= 240:
+        raise InputError(f"--rate {in_words(rate).removesuffix('.0')}: expected above 0 and at most 240")
     if not isinstance(size, int) or size % 2 or not 8 <= size <= _LARGEST:
-        raise InputError(f"--size {size}: expected an even number from 8 to {_LARGEST}")
+        raise InputError(f"--size {in_words(size)}: expected an even number from 8 to {_LARGEST}")
     checks.integer("turntable", "spp", spp, at_least=1)
-    if not -90 < elevation < 90:
-        raise InputError(f"--elevation {elevation:g}: expected above -90 and below 90 degrees")
-    if background not in BACKGROUNDS:
-        raise InputError(f"--background {background}: expected {', '.join(BACKGROUNDS)}")
+    if not -90 < checks.real(elevation) < 90:
+        raise InputError(
+            f"--elevation {in_words(elevation).removesuffix('.0')}: expected above -90 and below 90 degrees"
+        )
+    if not isinstance(background, str) or background not in BACKGROUNDS:
+        raise InputError(f"--background {printable(background)}: expected {', '.join(BACKGROUNDS)}")
 
 
 def _axis(up: Sequence[float]) -> np.ndarray:
-    axis = np.array(up, float)
+    try:
+        axis = np.array(up, float)
+    except (TypeError, ValueError, OverflowError):
+        axis = np.zeros(0)
     if axis.shape != (3,) or not np.isfinite(axis).all() or not np.linalg.norm(axis) > 0:
-        raise InputError(f"--up {up}: expected three numbers, not all 0")
+        raise InputError(f"--up {in_words(up)}: expected three numbers, not all 0")
     return axis / np.linalg.norm(axis)
 
 

@@ -16,7 +16,7 @@ from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
 from unrender.core.geometry import MITSUBA_TO_OPENGL
-from unrender.core.text import did_you_mean
+from unrender.core.text import did_you_mean, in_words
 from unrender.display.pictures import png
 from unrender.io import images, mesh_files
 
@@ -289,6 +289,8 @@ OWN = frozenset(name for known in FORMATS.values() for name in known.files)
 def check(formats: Sequence[str]) -> tuple[str, ...]:
     """Return the formats to write and those that they need, once each. Raises `InputError` for an unknown one or a missing package."""
     known = (MITSUBA, *FORMATS)
+    if isinstance(formats, str) or not isinstance(formats, Sequence):
+        raise InputError(f"--format: expected a list of {', '.join(known)}, got {in_words(formats)}")
     for name in formats:
         if name not in known:
             raise InputError(f"--format {name}: expected {', '.join(known)}{did_you_mean(name, known)}")

@@ -124,9 +124,10 @@ def export(
 def _opened(
     what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
 ) -> tuple[Problem, Mapping[str, np.ndarray], _Maps, list[str]]:
-    if not isinstance(what, (str, Path)):
+    if isinstance(what, tuple) and len(what) == 2 and isinstance(what[0], Problem):
         return what[0], what[1], {}, []
-    if Path(what).suffix.lower() == ".toml":
+    what = checks.path("export", what, "a run folder, a problem file, or (problem, values)")
+    if what.suffix.lower() == ".toml":
         problem = Problem.from_file(what)
         return problem, problem.initial_values(), {}, []
     run = folders.read(what)

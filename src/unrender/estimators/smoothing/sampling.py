@@ -55,7 +55,10 @@ class SmoothedFunction:
 
     def __init__(self, name: str, f: Function, theta: Any, sigma: Any, options: SamplingOptions, sides: int = 1):
         self.owner, self.f, self.seed = f"smoothed.{name}", f, options.seed
-        self.theta = np.array(theta, np.float64)
+        try:
+            self.theta = np.array(theta, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{self.owner}: theta must be a finite vector (n,), got {in_words(theta)}") from error
         if self.theta.ndim != 1 or self.theta.size == 0 or not np.isfinite(self.theta).all():
             raise InputError(f"{self.owner}: theta must be a finite vector (n,), got shape {self.theta.shape}")
         self.n = self.theta.size
