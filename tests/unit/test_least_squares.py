@@ -111,6 +111,8 @@ def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_tha
     )
     own = curved.standard_errors({"a": np.zeros(2)}, {"a": np.ones(2)}, complete=True)["a"]
     np.testing.assert_allclose(own, [3.1, 1.0], rtol=1e-6)  # a run with a third of the check's error understates it
+    damped = curved.standard_errors({"a": np.zeros(2)}, {"a": np.array([1.0, np.inf])}, complete=True)["a"]
+    np.testing.assert_allclose(damped, [3.1, 2.9], rtol=1e-6)  # a camera's place, known to .01, was "not determined"
 
 
 def test_errors_of_a_run_that_has_converged_are_no_larger_with_a_check() -> None:

@@ -371,12 +371,13 @@ class NumbersCheck:
         errors, known = {}, known or {}
         for key, error in self.errors.items():
             square, noise, step = (np.square(x) for x in (error, self.noise[key], self.steps[key]))
-            own = np.square(known.get(key, 0.0)).reshape(-1)
-            if complete and key in known:
+            own = np.square(known.get(key, np.full(error.shape, np.inf))).reshape(-1)
+            sure = np.isfinite(own)  # a damped run may state none of a number that this check determines
+            unstated = np.maximum(square, noise) + np.maximum(step - noise, 0.0)
+            if complete:
                 limit = 1.0 if self.blind else _OWN**2  # the run does not know more of directions that noise hides
-                square = np.where(square > limit * own, square, own) + np.maximum(step - _CLEAR**2 * noise, 0.0)
+                stated = np.where(square > limit * own, square, own) + np.maximum(step - _CLEAR**2 * noise, 0.0)
             else:
-                square = square if key in known else np.maximum(square, noise)
-                square = np.maximum(square + np.maximum(step - noise, 0.0), own)
-            errors[key] = np.sqrt(square).reshape(values[key].shape).astype(np.float32)
+                stated = np.maximum(square + np.maximum(step - noise, 0.0), own)
+            errors[key] = np.sqrt(np.where(sure, stated, unstated)).reshape(values[key].shape).astype(np.float32)
         return errors
