@@ -1,5 +1,8 @@
 """Errors that a caller may catch. Each message is one line: what is wrong, and what was expected."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from unrender.core.text import one_line
 
 
@@ -19,6 +22,17 @@ class UnrenderError(Exception):
 
 class InputError(UnrenderError, ValueError):
     """Invalid input from the user: a file, a field, a name or a value. The command line exits with 2."""
+
+
+@contextmanager
+def prefixed(where: object) -> Iterator[None]:
+    """Begin the message of an `InputError` of the statements inside with `where` and a colon; "" leaves it unchanged."""
+    try:
+        yield
+    except InputError as error:
+        if where == "":
+            raise
+        raise InputError(f"{where}: {error}") from error
 
 
 class KeyedError(InputError):

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from unrender.core import registry
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.registry import GROUP
 from unrender.core.text import did_you_mean, in_words
 
@@ -56,10 +56,8 @@ def parse(text: str, kind: str) -> Any:
             names = (name for name, of in known.items() if any(each.name == _NEXT for each in dataclasses.fields(of)))
             raise InputError(f'{kind}: only {", ".join(names)} can have something after "then", got {text!r}')
         arguments[_NEXT] = parse(rest[0], kind)
-    try:
+    with prefixed(kind):
         return known[name](**arguments)
-    except InputError as error:
-        raise InputError(f"{kind}: {error}") from error
 
 
 def _number(text: str, kind: str) -> int | float:
@@ -118,12 +116,8 @@ def component(table: Any, kind: str | None = None, where: str = "", folder: Path
     Raises:
         InputError: unknown types or fields (with the nearest known one), missing fields, values of the wrong type or out of range.
     """
-    try:
+    with prefixed(where):
         return _component(table, kind, folder, 0)
-    except InputError as error:
-        if not where:
-            raise
-        raise InputError(f"{where}: {error}") from error
 
 
 def build(made_by: type[_T], fields: Mapping[str, Any]) -> _T:
@@ -195,10 +189,8 @@ def _value(value: Any, hint: Any, key: str, folder: Path | None, depth: int) -> 
     if kind is not None and typing.get_origin(hint) is tuple and isinstance(value, (list, tuple)):
         return tuple(_value(part, choices[1], f"{key}[{index}]", folder, depth) for index, part in enumerate(value))
     if kind is not None or (isinstance(value, Mapping) and _TYPE in value):
-        try:
+        with prefixed(key):
             return _component(value, kind, folder, depth + 1)
-        except InputError as error:
-            raise InputError(f"{key}: {error}") from error
     if folder is not None and isinstance(value, str) and Path in choices:
         return str(folder / value)
     return value

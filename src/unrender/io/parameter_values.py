@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import arrays, checks, periodic
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import in_words
 from unrender.io import bounded_files, images, resampling, volumes
 
@@ -134,10 +134,8 @@ def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
         return _from_mesh(path, shape, conversion), ""
     if ending in (".npy", ".npz"):
         array = volumes.read_numpy(path, lambda size: _check_shape(size, shape, conversion))
-        try:
+        with prefixed(path):
             return fill(array.astype(np.uint8) if array.dtype == bool else array, shape, conversion)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
     picture = images.read(path, not conversion.raw)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
 
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import shorten
 from unrender.io import bounded_files, image_size, mesh_files, volumes
 
@@ -49,10 +49,8 @@ _KINDS_OF_PATHS = {"": "no such file", "folder": "a folder, expected a file", "o
 
 
 def _picture(path: Path) -> int:
-    try:
+    with prefixed(path):
         return image_size.check(path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _plain(path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from unrender.core import checks
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import in_words
 from unrender.io import bounded_files, files
 
@@ -136,11 +136,9 @@ def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.n
     file = _existing(path)
 
     def named(shape: Shape) -> None:
-        try:
+        with prefixed(file):
             if check is not None:
                 check(shape)
-        except InputError as error:
-            raise InputError(f"{file}: {error}") from error
 
     if file.suffix.lower() == ".npz":
         (array,) = bounded_files.read_arrays(file, check=named, one=True).values()
@@ -183,7 +181,7 @@ def _read_vol(path: Path, check: Callable[[Shape], None]) -> Grid:
 
 def _vol_header(file: IO[bytes], path: Path, check: Callable[[Shape], None]) -> tuple[Shape, tuple[float, ...]]:
     """Return the shape (Z, Y, X, C) and the box; the file is then at its numbers. Raises `InputError`."""
-    try:
+    with prefixed(path):
         head = file.read(_HEADER.size)
         if head[:3] != _MAGIC[:3]:
             raise InputError("not a .vol file: it does not begin with VOL")
@@ -203,8 +201,6 @@ def _vol_header(file: IO[bytes], path: Path, check: Callable[[Shape], None]) -> 
         actual, declared = os.fstat(file.fileno()).st_size - _HEADER.size, 4 * math.prod(shape)
         if actual != declared:
             raise InputError(f"its header declares {declared} bytes of numbers, there are {actual}")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     return shape, tuple(box)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import in_words, reason_of
 
 Backend = Literal["drjit", "torch"]
@@ -105,10 +105,8 @@ class FunctionLoss:
     def _evaluate(self, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
         if "_framework" not in self.__dict__:
             self.prepare(arrays.numpy(reference))
-        try:
+        with prefixed(f"loss: {self!r}"):
             return _CALLS[self.__dict__["_framework"]](self, image, reference, derivative)
-        except InputError as error:
-            raise InputError(f"loss: {self!r}: {error}") from error
 
 
 def _each(of_one: Callable[[Array, Array], Array], images: Array, references: Array) -> Array:

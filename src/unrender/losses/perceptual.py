@@ -18,7 +18,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.checks import Positive
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean, in_words, reason_of
 from unrender.io import bounded_files
@@ -171,10 +171,8 @@ def _age(path: Path | None) -> int:
 def _load(path: Path | None, age: int, layers: tuple[str, ...], dtype: str) -> _Network:
     _torch()
     source = "of torchvision" if path is None else str(path)
-    try:
+    with prefixed(f"Perceptual: weights {source}"):
         return _Network(_from_torchvision() if path is None else _read(path), layers, dtype)
-    except InputError as error:
-        raise InputError(f"Perceptual: weights {source}: {error}") from error
 
 
 def _read(path: Path) -> Mapping[str, Any]:

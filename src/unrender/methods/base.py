@@ -13,7 +13,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict
 
 from unrender.core import registry
-from unrender.core.errors import InputError, UnknownOptionError
+from unrender.core.errors import InputError, UnknownOptionError, prefixed
 from unrender.core.text import did_you_mean, grouped, in_words
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Method:
     def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
         """Return estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
         options = self.configure(settings or {})
-        with self._named():
+        with prefixed(f"method {self.name}"):
             parts = options.build()
             if self.options.plan is Options.plan:  # otherwise the problem decides which options have an effect
                 for name in settings or {}:
@@ -117,7 +117,7 @@ class Method:
     def plan(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Plan:
         """Return the plan for a problem, with `settings` in place of defaults. Raises `InputError`, also for one without effect."""
         options = self.configure(settings or {})
-        with self._named(), measuring_once():
+        with prefixed(f"method {self.name}"), measuring_once():
             plan = options.plan(problem)
             for name in settings or {}:
                 check_effect(options, name, lambda one: _decisions(one.plan(problem)), _decisions(plan))
@@ -126,17 +126,10 @@ class Method:
     def with_effect(self, problem: Problem, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings that change the plan for a problem. Raises `InputError`."""
         options = self.configure(settings)
-        with self._named(), measuring_once():
+        with prefixed(f"method {self.name}"), measuring_once():
             decide: Decide = lambda one: _decisions(one.plan(problem))  # noqa: E731
             decided = decide(options)
             return {name: x for name, x in settings.items() if has_effect(options, name, decide, decided)}
-
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        try:
-            yield
-        except InputError as error:
-            raise InputError(f"method {self.name}: {error}") from error
 
 
 def _decisions(plan: Plan) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ import safetensors.numpy
 
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.sample_groups import PIXELS
@@ -287,10 +287,8 @@ def read_state(path: Path, options: dict[str, Any], pattern: RendererState) -> R
         tensors = {name: array.copy() for name, array in safetensors.numpy.load(data).items()}
     except (safetensors.SafetensorError, KeyError) as error:
         raise InputError(f"{path}: tensors cannot be read: {str(error)[:200]}") from error
-    try:
+    with prefixed(path):
         state = unpack(Packed(skeleton, tensors), [pattern])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     if not _fits(state, pattern):
         raise InputError(f"{path}: not the state of a Renderer with these options")
     return state

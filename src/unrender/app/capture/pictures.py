@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from unrender.app.capture.cameras import Lens, opencv
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import printable, reason_of
 from unrender.io import bounded_files, image_size, images, tiff_header
 
@@ -199,10 +199,8 @@ def _decode(path: Path) -> np.ndarray | None:
 
 
 def _header(path: Path) -> image_size.Header:
-    try:
+    with prefixed(path):
         header = image_size.read_photograph_header(path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     width, height, _ = header.sizes[0]
     _check_size(path, width, height)
     return header

@@ -17,7 +17,7 @@ import numpy as np
 from unrender.app.capture import pictures
 from unrender.app.capture.cameras import FISHEYE, Lens, opencv
 from unrender.app.capture.capture import Capture, CapturedView, Photograph, StoredViews
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import printable
 
 _EMPTY = 1e-4
@@ -90,12 +90,10 @@ def _view(
     photograph: Photograph, resolution: int, scale: float | None, held_out: bool, response: str, masks: bool
 ) -> tuple[CapturedView, bool]:
     width, height, orientation = pictures.upright(photograph.file, photograph.lens)
-    try:
+    with prefixed(photograph.file):
         lens = photograph.lens or Lens.of_field_of_view(photograph.field_of_view, width, height)
         lens = lens.scaled(width, height)
         target = pinhole(lens, min(1.0, resolution / max(width, height)) if scale is None else scale)
-    except InputError as error:
-        raise InputError(f"{photograph.file}: {error}") from error
     read = pictures.read(photograph.file, orientation, response)
     if read.values.shape[:2] != (height, width):
         have = f"{read.values.shape[1]} x {read.values.shape[0]}"

@@ -16,7 +16,7 @@ import typer
 from unrender.app.cli import arguments
 from unrender.app.cli.signals import DOUBTFUL
 from unrender.core import lazy, phases
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
@@ -98,14 +98,12 @@ def begin(
     stages = replace(stages, steps=steps, seconds=seconds, seed=stages.seed if seed is None else seed)
     check_seed("seed", stages.seed, len(stages.stages))
     for stage in stages.stages:
-        try:
+        with prefixed(f"{file}: stage {stage.name}"):
             chosen, settings = methods.method(stage.method or stages.method), stages.settings_of(stage)
             if stages.settings:  # those that stages share may have no effect in this one
                 chosen.configure(settings).build()
             else:
                 chosen.start(settings)
-        except InputError as error:
-            raise InputError(f"{file}: stage {stage.name}: {error}") from error
     if out is not None and out.resolve() == file.resolve().parent:
         raise InputError(f"--out {out}: the folder of {file.name} itself; give another one")
     if out is not None and (out / stages_file.FILE).is_file() and not stages_file.is_of_run(out / stages_file.FILE):

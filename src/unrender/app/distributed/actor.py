@@ -48,12 +48,10 @@ class ViewWorker:
         """Build a share of the problem, replacing an earlier one. Raise `InputError` if this fails."""
         from unrender.app.distributed.share import ViewShare
         from unrender.app.distributed.transfer import unpacked
-        from unrender.core.errors import InputError
+        from unrender.core.errors import prefixed
 
-        try:
+        with prefixed(f"worker on {socket.gethostname()}"):
             problem = unpacked(blob, load_ray())
-        except InputError as error:
-            raise InputError(f"worker on {socket.gethostname()}: {error}") from error
         self._shares[share] = ViewShare(problem, views)
 
     def drop(self, share: int) -> None:

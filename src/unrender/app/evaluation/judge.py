@@ -31,7 +31,7 @@ from unrender.app.exporting.asset import read_environment
 from unrender.app.stages import stages_file
 from unrender.backend import variant
 from unrender.core import arrays, checks, phases
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.exclusive import exclusive
 from unrender.io import files
 from unrender.io.images import luminance
@@ -290,10 +290,8 @@ def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
 def _measure(problem: Problem, images: list[np.ndarray]) -> list[Measures]:
     measures = []
     for name, view, image in zip(names_of(problem), problem.views, images, strict=True):
-        try:
+        with prefixed(name):
             measures.append(measure(image, np.asarray(view.reference), view.pixel_weights()))
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
     return measures
 
 

@@ -18,7 +18,7 @@ from unrender.app.exporting.formats import write as write_formats
 from unrender.app.exporting.graph import SceneGraph, reachable, store
 from unrender.backend import variant
 from unrender.core import arrays, checks, periodic
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.exclusive import exclusive
 from unrender.io import files
 from unrender.rendering.mitsuba import mesh_layout, poses
@@ -195,10 +195,8 @@ def _fill(
         graph.live[places[key].key] = from_tensor(described.colours.native(key, renderer.array(value)), live)
     graph.live.update()
     for key, value in own.items():
-        try:
+        with prefixed(f"parameter {key} cannot be exported"):
             store(graph, places[key], value, key, folder)
-        except InputError as error:
-            raise InputError(f"parameter {key} cannot be exported: {error}") from error
     posed = [_move(graph, target, matrix) for target, matrix in poses.matrices(scene, moved).items()]
     _set_up_rendering(graph, renderer, max_depth, spp)
     _gather_files(graph, folder)

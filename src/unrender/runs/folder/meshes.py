@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import printable
 from unrender.io import files, mesh_files
 from unrender.scene.problem import Problem
@@ -73,15 +73,13 @@ def meshes_in(
         if faces is None or not len(faces):
             continue
         truth = arrays.get(f"{key}/{_VERTICES}"), arrays.get(f"{key}/{_TRUE_FACES}")
-        try:
+        with prefixed(f"{path}: {printable(key)}"):
             checked = _checked(faces, values)
             first = _checked(arrays.get(f"{key}/{_FIRST}", faces), initial[key])
             uv = arrays.get(f"{key}/{_UV}")
             if uv is not None and uv.shape != (values.size // 3, 2):
                 raise InputError(f"surface: expected texture coordinates of shape (V, 2), got {uv.shape}")
             surface = None if truth[0] is None or truth[1] is None else Surface(truth[0], truth[1])
-        except InputError as error:
-            raise InputError(f"{path}: {printable(key)}: {error}") from error
         meshes[key] = RunMesh(checked, first, surface, uv)
     return meshes
 

@@ -17,7 +17,7 @@ import numpy as np
 from unrender.app.capture.cameras import FISHEYE, RADIAL_TANGENTIAL, Lens
 from unrender.app.capture.capture import Capture, Photograph, pose
 from unrender.app.capture.formats import files
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import printable
 from unrender.io import bounded_files
 
@@ -134,11 +134,9 @@ def _lens(model: str, width: int, height: int, parameters: Numbers, where: str) 
     if len(parameters) != MODELS[model].count:
         raise InputError(f"{where}: {model} has {MODELS[model].count} parameters, got {len(parameters)}")
     pinhole, kind, distortion = MODELS[model].parts(parameters)
-    try:
+    with prefixed(where):
         fx, fy, cx, cy = pinhole
         return Lens(width, height, fx, fy, cx, cy, kind, distortion)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 # ---------------------------------------------------------------------- text

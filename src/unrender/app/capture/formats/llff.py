@@ -14,7 +14,7 @@ import numpy as np
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import Capture, Photograph, pose
 from unrender.app.capture.formats import files
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.io import bounded_files
 
 FILE = "poses_bounds.npy"
@@ -47,10 +47,8 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         where = f"{path}: row {index}"
         matrix = row[:15].reshape(3, 5)
         height, width, focal = (float(number) for number in matrix[:, 4])
-        try:
+        with prefixed(where):
             lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
         mask = files.find_mask(folder, file, masks)
         camera_pose, scale = pose(matrix[:, :4], AXES, False, where)
         photographs.append(Photograph(file.name, file, lens, camera_pose, mask, scale=scale))

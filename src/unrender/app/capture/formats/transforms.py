@@ -18,7 +18,7 @@ from typing import Any
 from unrender.app.capture.cameras import FISHEYE, RADIAL_TANGENTIAL, Lens
 from unrender.app.capture.capture import Capture, Photograph, pose
 from unrender.app.capture.formats import files
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, prefixed
 from unrender.core.text import printable
 from unrender.io import bounded_files
 
@@ -113,10 +113,8 @@ def _lens(numbers: Mapping[str, Any], where: str) -> tuple[Lens | None, float]:
     fy = _number(numbers, "fl_y", where, fx)
     width, height = (round(_number(numbers, name, where)) for name in ("w", "h"))
     cx, cy = _number(numbers, "cx", where, width / 2), _number(numbers, "cy", where, height / 2)
-    try:
+    with prefixed(where):
         return Lens(width, height, fx, fy, cx, cy, FISHEYE if fisheye else RADIAL_TANGENTIAL, distortion), 0.0
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _number(numbers: Mapping[str, Any], name: str, where: str, default: float | None = None) -> float:
