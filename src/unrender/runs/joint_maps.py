@@ -46,6 +46,9 @@ _BLURRED, _SEEN = 4.0, 0.005
 """Overlap of `Curvature` from which neighbouring texels may not be told apart; least change of the images by the constant."""
 _STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
 """Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
+_MOST_FACTOR, _OF_AGAIN = 16, 8.0
+"""Largest factor of the number of samples, which becomes four times as large; time left, relative to the time of a surface so far, for
+the next one."""
 
 
 def hidden_changes(
@@ -59,16 +62,25 @@ def hidden_changes(
 
     Args:
         values: {key: array} at the end of a run.
-        spp: samples per pixel of each rendering.
+        spp: samples per pixel of each rendering, of which noise may hide the changes. While time is left, there are more.
         seconds: time limit of the tests of all surfaces together.
         per_pass: see `render`.
     """
-    lines, until = [], timing.now() + seconds
-    for keys in _surfaces(problem):
+    lines, until, surfaces = [], timing.now() + seconds, [*_surfaces(problem)]
+    for index, keys in enumerate(surfaces):
+        started, factor, left = timing.now(), 1, until - timing.now()
         try:
-            lines += _Surface(problem, values, keys, spp, per_pass).line(until - timing.now())
+            own = _Surface(problem, values, keys, spp, per_pass).line(left)
+            while (
+                not own
+                and factor < _MOST_FACTOR
+                and _OF_AGAIN * (timing.now() - started) * (len(surfaces) - index) < left
+            ):
+                factor *= 4
+                own = _Surface(problem, values, keys, factor * spp, per_pass, factor).line(math.inf)
         except InputError:  # the renderer rejects a value
             continue
+        lines += own
     return lines
 
 
@@ -163,26 +175,25 @@ def _surfaces(problem: Problem) -> Iterator[list[str]]:
     known = problem.renderer.parameters()
     if len(selected_views(problem)) < len(problem.views):
         return
-    maps = [
-        key
-        for key, unknown in problem.unknowns.items()
-        if len(known[key].shape) == MAP_AXES and known[key].differentiable and unknown.prior is None
-    ]
+    maps = [key for key in problem.unknowns if len(known[key].shape) == MAP_AXES and known[key].differentiable]
     for _, of in groupby(sorted(maps, key=_surface_of), key=_surface_of):
         keys = sorted(of)
-        if len(keys) > 1 or known[keys[0]].role == "normal":
+        free = any(problem.unknowns[key].prior is None for key in keys)  # otherwise priors decide
+        if free and (len(keys) > 1 or known[keys[0]].role == "normal"):
             yield keys
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """Textures of one surface, whose texels share the cells of the coarsest one; for the attributes, see `hidden_changes`."""
+    """Textures of one surface, whose texels share the cells of the coarsest one; for the attributes, see `hidden_changes`. `factor`
+    multiplies the number of adjoints."""
 
     problem: Problem
     values: Mapping[str, np.ndarray]
     keys: Sequence[str]
     spp: int
     per_pass: int | None
+    factor: int = 1
 
     def line(self, seconds: float) -> list[str]:
         """Return the line; [] for none."""
@@ -301,10 +312,11 @@ class _Surface:
         tree, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
         shape = tuple(min(np.shape(values[name])[axis] for name in self.keys) for axis in (0, 1))
         matrix = np.zeros((len(fields), *shape, len(fields)))
-        for launch in range(1, 1 + _LAUNCHES):
+        launches = self.factor * _LAUNCHES
+        for launch in range(1, 1 + launches):
             seeds = {view: key.fold(launch).fold(view) for view in views}
             of = adjoints(problem, session, tree, keys, spp, seeds, changes)
-            matrix += np.stack([_pooled((of[name] * x).sum(axis=-1), shape) for name, x in fields], axis=-1) / _LAUNCHES
+            matrix += np.stack([_pooled((of[name] * x).sum(axis=-1), shape) for name, x in fields], axis=-1) / launches
         matrix = np.moveaxis(matrix, 0, -2)
         return 0.5 * (matrix + matrix.swapaxes(-1, -2))
 
