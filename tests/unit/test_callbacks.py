@@ -187,6 +187,16 @@ def test_a_callback_may_add_arrays_to_the_history_and_return_nothing(tmp_path: P
     assert (record["psnr"], record["sizes"], record["thing"]) == (1.5, [1.0, None], repr(Path))
 
 
+@pytest.mark.parametrize("value", ["done", 10**400, {}, np.zeros(2)])
+def test_a_callback_that_returns_no_result_is_named_in_a_warning(value: Any) -> None:
+    class Own(Callback):
+        def on_result(self, run: Any, result: ur.Result) -> Any:
+            return value
+
+    result = ur.optimize(problem(), ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=1, callbacks=[Own()])
+    assert result.warnings[-1].startswith("Own.on_result: expected a Result, got ")
+
+
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("folder", ["", 5, None])
 def test_what_is_no_folder_is_refused(folder: Any) -> None:

@@ -203,6 +203,7 @@ _WRONG: list[Any] = [3, [1, "a"], {1: 2}, object(), int, np.zeros(3), b"x", {1},
         (lambda x: ur.app.turntable("nowhere", "a.mp4", background=x), ""),
         (lambda x: ur.app.turntable("nowhere", "a.mp4", up=x), ""),
         (lambda x: ur.gallery.photographs(x), "x"),
+        (lambda x: ur.smoothed.gradient(lambda points: x, np.zeros(2), 0.1, 16), ""),
         (lambda x: ur.smoothed.gradient(lambda points: points[:, 0], x, 0.1, 16), "array"),
     ],
 )

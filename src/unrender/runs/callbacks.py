@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from unrender.core.phases import Listener
+from unrender.core.text import in_words
 
 if TYPE_CHECKING:
     from unrender.estimators.base import Estimate
@@ -93,7 +94,14 @@ class UserCallbacks(Callback):
 
     def on_result(self, run: Run, result: Result) -> Result:
         for callback in self._callbacks:
-            result = callback.on_result(run, result) or result  # of a callback that returns nothing
+            after: Any = callback.on_result(run, result)
+            if isinstance(after, type(result)):
+                result = after
+            elif after is not None:  # a callback may return nothing
+                line = (
+                    f"{type(callback).__name__}.on_result: expected a Result, got {in_words(after)}, which is ignored"
+                )
+                result = replace(result, warnings=[*result.warnings, line])
         return result
 
     def warnings(self, run: Run) -> list[str]:

@@ -27,7 +27,7 @@ from unrender.core import checks, conjugate_gradients
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.estimators.smoothing.function import JointDerivatives, estimate_gradient, estimate_hvp, joint
-from unrender.estimators.smoothing.sampling import Function, SamplingOptions
+from unrender.estimators.smoothing.sampling import Function, SamplingOptions, numbers
 
 # PyTorch is an optional dependency, and absent if types are checked without the extra.
 try:
@@ -267,7 +267,8 @@ class _BlackBox:
         return [call(lambda _: next(answers)) for call in calls]
 
     def _evaluate(self, points: np.ndarray, items: np.ndarray) -> np.ndarray:
-        values = np.asarray(self.f(points, items) if self.batched else self.f(points), np.float64)
+        results = self.f(points, items) if self.batched else self.f(points)
+        values = numbers(results, "grey_box.loss: f must return numbers")
         if values.shape != (len(points),):
             raise InputError(
                 f"grey_box.loss: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"

@@ -39,6 +39,14 @@ _dropped = DropReport()
 _ORTHOGONAL = 1 << 20  # stream of random numbers for orthogonal samples
 
 
+def numbers(values: Any, expected: str) -> np.ndarray:
+    """Return a new array of float64. Raises `InputError` that begins with `expected` for anything but numbers."""
+    try:
+        return np.array(values, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{expected}, got {in_words(values)}") from error
+
+
 class SmoothedFunction:
     """f convolved with a Gaussian of standard deviation σ, at one point θ: validation, sampling, evaluation, statistics.
 
@@ -55,10 +63,7 @@ class SmoothedFunction:
 
     def __init__(self, name: str, f: Function, theta: Any, sigma: Any, options: SamplingOptions, sides: int = 1):
         self.owner, self.f, self.seed = f"smoothed.{name}", f, options.seed
-        try:
-            self.theta = np.array(theta, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{self.owner}: theta must be a finite vector (n,), got {in_words(theta)}") from error
+        self.theta = numbers(theta, f"{self.owner}: theta must be a finite vector (n,)")
         if self.theta.ndim != 1 or self.theta.size == 0 or not np.isfinite(self.theta).all():
             raise InputError(f"{self.owner}: theta must be a finite vector (n,), got shape {self.theta.shape}")
         self.n = self.theta.size
@@ -177,7 +182,7 @@ class SmoothedFunction:
 
         Raises `InputError` for values of another shape than (B,), or if none is finite.
         """
-        values = np.asarray(self.f(points), np.float64)
+        values = numbers(self.f(points), f"{self.owner}: f must return numbers")
         if values.shape != (len(points),):
             raise InputError(
                 f"{self.owner}: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
