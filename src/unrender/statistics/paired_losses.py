@@ -202,7 +202,8 @@ def at_border(
 
     A frame or padding of the reference leaves such a difference, as does a shift that wraps around. It is too small a part of the picture
     for `nearby`. Its products at a distance of 2 must agree along the line. Their sum must be four times the sum of squares of each line
-    beside it, and of the reference's noise in the line, as those lines and the pictures' noise suggest it. Otherwise the score is 0.
+    beside it, and of the reference's noise in the line, as those lines and the pictures' noise suggest it, and exceed the pictures'
+    noise in the line. Otherwise the score is 0.
 
     Args:
         one, other: differences of two independent pictures, (N, C).
@@ -221,7 +222,7 @@ def at_border(
                 along = 0.5 * (a[0, :-DISTANCE] * b[0, DISTANCE:] + b[0, :-DISTANCE] * a[0, DISTANCE:]).sum(axis=1)
                 total, deviation = float(along.sum()), _OF_PRODUCTS * math.sqrt(float(np.square(along).sum()))
                 expected = float(np.median(shared[1:] / np.maximum(noise[1:], 1e-300)) * noise[0])
-                beyond = total > _OF_NOISE * max(float(shared[1:].max()), expected)
+                beyond = total > max(_OF_NOISE * max(float(shared[1:].max()), expected), float(noise[0]))
                 if beyond and total > _ALONG * deviation and shared[0] > most:
                     most, place = float(shared[0]), f" in its {name} of pixels"
     square = most / max(float(weights.sum()) * one.shape[1], 1e-300)
