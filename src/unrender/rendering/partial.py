@@ -101,39 +101,6 @@ class EliminatedParameters(HeldParameters):
         return _EliminatedSession(self.inner.prepare(everything, space, derivatives=False), self)
 
 
-class _EliminatedSession(SessionWrapper):
-    """A session that adds the fixed and the eliminated parameters of an `EliminatedParameters` to each state."""
-
-    def __init__(self, inner: RenderSession, renderer: EliminatedParameters):
-        super().__init__(inner)
-        self._renderer = renderer
-
-    def _state(self, parameters: Tree) -> Tree:
-        stacked = {key: arrays.numpy(x)[None] for key, x in parameters.items()}
-        moved = {
-            key: arrays.like(x[0], self._renderer.held[key]) for key, x in self._eliminated_values(stacked).items()
-        }
-        return {**self._renderer.held, **moved, **parameters}
-
-    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        count = len(next(iter(parameters.values())))
-        held = {key: np.broadcast_to(x, (count, *x.shape)) for key, x in trees.numpy(self._renderer.held).items()}
-        return self._inner.image_batch({**held, **self._eliminated_values(parameters), **parameters}, request)
-
-    def _eliminated_values(self, parameters: Tree) -> dict[str, np.ndarray]:
-        """Return the values of the eliminated parameters in each state, (B, *shape); {} if all states are at the origin."""
-        flat = [np.asarray(x, np.float64).reshape(len(x), -1) for x in parameters.values()]
-        change = np.concatenate(flat, axis=1) - self._renderer.origin
-        if not change.any():
-            return {}
-        moved = {
-            key: (arrays.numpy(self._renderer.held[key]) + np.tensordot(change, slopes, 1)).astype(np.float32)
-            for key, slopes in self._renderer.slopes.items()
-            if slopes.any()
-        }
-        return {key: self._renderer.bounds[key](values) for key, values in moved.items()}
-
-
 class _HeldSession(SessionWrapper):
     """A session that adds the fixed parameters to each state and removes them from each gradient."""
 
@@ -154,3 +121,32 @@ class _HeldSession(SessionWrapper):
         count = len(next(iter(parameters.values())))
         held = {key: np.broadcast_to(x, (count, *x.shape)) for key, x in trees.numpy(self._held).items()}
         return self._inner.image_batch({**held, **parameters}, request)
+
+
+class _EliminatedSession(_HeldSession):
+    """A session that adds the fixed and the eliminated parameters of an `EliminatedParameters` to each state."""
+
+    def __init__(self, inner: RenderSession, renderer: EliminatedParameters):
+        super().__init__(inner, renderer.held)
+        self._renderer = renderer
+
+    def _state(self, parameters: Tree) -> Tree:
+        moved = self._eliminated_values({key: arrays.numpy(x)[None] for key, x in parameters.items()})
+        moved = {key: arrays.like(x[0], self._held[key]) for key, x in moved.items()}
+        return super()._state({**moved, **parameters})
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        return super().image_batch({**self._eliminated_values(parameters), **parameters}, request)
+
+    def _eliminated_values(self, parameters: Tree) -> dict[str, np.ndarray]:
+        """Return the values of the eliminated parameters in each state, (B, *shape); {} if all states are at the origin."""
+        flat = [np.asarray(x, np.float64).reshape(len(x), -1) for x in parameters.values()]
+        change = np.concatenate(flat, axis=1) - self._renderer.origin
+        if not change.any():
+            return {}
+        moved = {
+            key: (arrays.numpy(self._held[key]) + np.tensordot(change, slopes, 1)).astype(np.float32)
+            for key, slopes in self._renderer.slopes.items()
+            if slopes.any()
+        }
+        return {key: self._renderer.bounds[key](values) for key, values in moved.items()}

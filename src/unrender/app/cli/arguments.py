@@ -312,7 +312,7 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
         while out.exists():
             number += 1
             out = Path("out", f"{name}-{number}")
-    try:
+    with files.input_errors(f"--out {out}"):
         if out.exists() and not out.is_dir():
             raise InputError(f"--out {out}: a file, expected a folder")
         if out.is_dir() and any(not path.is_dir() for path in out.rglob("*")):
@@ -321,8 +321,6 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
             if not overwrite:
                 raise InputError(f"--out {out}: contains earlier results; give --overwrite to replace them")
         files.make_folder(out)
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror or error}") from error
     if not os.access(out, os.W_OK | os.X_OK):
         raise InputError(f"--out {out}: not writable")
     return out

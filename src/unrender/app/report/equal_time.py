@@ -107,9 +107,7 @@ class Metric:
     def best_at(self, index: int, axis: str = "seconds") -> str | None:
         """Return the method with the lowest median at `SHARES[index]` of the time or of the samples; None for a single method."""
         errors = {label: of.moments if axis == "seconds" else of.at_samples for label, of in self.methods.items()}
-        medians = {label: of[index].error.median for label, of in errors.items()}
-        known = {label: value for label, value in medians.items() if value is not None}
-        return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
+        return _best({label: of[index].error.median for label, of in errors.items()})
 
 
 @dataclass(frozen=True)
@@ -136,10 +134,13 @@ class Comparison:
 
     def best_image(self, metric: ImageMetric) -> str | None:
         """Return the method with the best median of an image metric; None for a single method, or if no value is known."""
-        medians = {label: of.median for label, of in self.images[metric.name].items()}
-        known = {label: value for label, value in medians.items() if value is not None}
-        best = max if metric.larger_is_better else min
-        return best(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
+        sign = -1.0 if metric.larger_is_better else 1.0
+        return _best({k: x.median and sign * x.median for k, x in self.images[metric.name].items()})
+
+
+def _best(medians: Mapping[str, float | None]) -> str | None:
+    known = {label: value for label, value in medians.items() if value is not None}
+    return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
 
 
 def compare_groups(groups: tuple[Group, ...]) -> Comparison:

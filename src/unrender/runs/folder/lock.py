@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files
+from unrender.io import bounded_files, files
 from unrender.runs.folder.schema import LOCK
 
 _LARGEST = 1 << 12
@@ -58,11 +58,9 @@ class Lock:
 
     def acquire(self) -> None:
         """Acquire the lock. Raises `InputError` if another process holds it, or it cannot be taken, with the holder or the reason."""
-        try:
+        with files.input_errors(f"run folder {self.path.parent}: cannot be locked"):
             while self._file is None:
                 self._file = self._try()
-        except OSError as error:
-            raise InputError(f"run folder {self.path.parent}: cannot be locked: {error.strerror or error}") from error
 
     def is_held(self) -> bool:
         """Return whether the folder still has this lock: it may have been deleted, and locked by another process."""
