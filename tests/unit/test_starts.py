@@ -11,9 +11,10 @@ import pytest
 
 from tests.analytic import AnalyticRenderer
 from unrender import losses
+from unrender.estimators import PathGradient
 from unrender.methods import method
 from unrender.methods.plan import Plan
-from unrender.methods.rules import exchangeable, starts
+from unrender.methods.rules import exchangeable, places, starts
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.paths import start_factors
 from unrender.runs.optimize import optimize
@@ -109,7 +110,8 @@ def test_a_far_start_is_left_for_a_place_whose_picture_is_much_better(
     [
         ([2.5, 6.5], (0.0, 10.0), {}),  # near
         ([9.5, 0.5], None, {}),  # without bounds
-        ([9.5, 0.5], (0.0, None), {}),
+        ([9.5, 0.5], (None, 10.0), {}),
+        ([9.5, 0.5], (0.0, None), {"rigid": True}),
         ([9.5, 0.5], (0.0, 10.0), {"nonlinear": False}),  # of brightness
         (
             [9.5, 0.5],
@@ -124,6 +126,40 @@ def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(
     plan = method("auto").plan(problem(monkeypatch, start, bounds, **traits))
     assert not any("other values" in reason for reason in plan.reasons)
     np.testing.assert_allclose(first(plan)["place"], start)
+
+
+@pytest.mark.parametrize("lamp", [4.0, 0.5])
+@pytest.mark.parametrize("descends", [True, False])
+def test_positive_numbers_descend_from_places_of_other_magnitudes(
+    lamp: float, descends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A focus distance 2.5 times too near ended at 0, and an extinction ten times too large at a phase function of mirrors. The planted
+    fault are places alone, which are far apart."""
+    made = problem(monkeypatch, [12.0, 1.0], (0.0, None), lamp=lamp)
+    if not descends:
+        monkeypatch.setattr(starts._Comparison, "_stepped", lambda self, keys, descent: descent)
+    plan = method("auto").plan(made)
+    begun = first(plan)
+    assert bool(np.linalg.norm(begun["place"] - TRUTH["place"]) < 0.2) is descends
+    assert plan.other_starts == ("place",)
+    if descends:
+        assert begun["lamp"] == pytest.approx(4.0, rel=0.1)
+    for x in ([0.5, 0.5], [0.1, 0.9]):
+        values = places.values_at(made, ["place"], np.array(x), made.initial_values())
+        np.testing.assert_allclose(places.coordinates_of(made, ["place"], values), x, rtol=1e-5)
+    np.testing.assert_allclose(
+        places.values_at(made, ["place"], np.ones(2), {"place": np.ones(2)})["place"], [120.0, 10.0]
+    )
+    assert places.coordinates_of(made, ["place"], {"place": np.zeros(2)}).tolist() == [0.0, 0.0]
+
+
+def test_path_gradients_of_positive_numbers_start_at_the_best_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An extinction that started ten times too small took 24 of 48 steps before it moved."""
+    made = problem(monkeypatch, [12.0, 1.0], (0.0, None), brightness="", nonlinear=False, scattering="medium")
+    made = Problem(made.renderer, made.parameters, made.views, losses.L1())
+    plan = method("auto").plan(made)
+    assert isinstance(plan.estimator, PathGradient)
+    np.testing.assert_allclose(first(plan)["place"], TRUTH["place"], atol=0.2)
 
 
 @pytest.mark.parametrize(
@@ -237,15 +273,17 @@ def test_places_are_spread_over_the_range(
     info = dataclasses.replace(renderer.parameters()["place"], nonlinear=True, role=role)
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: {"place": info})
     made = Problem(renderer, [Parameter("place", bounds=(-1.0, 1.0))], [View(np.zeros((*SHAPE, 3)))])
-    places = np.array([starts._value(made, "place", x, np.zeros(size)) for x in starts._points(made, ["place"])])
-    assert len(places) == number
-    assert (np.abs(places) <= 1.0).all()
+    spread = np.array([places._value(made, "place", x, np.zeros(size)) for x in places.points(made, ["place"])])
+    assert len(spread) == number
+    assert (np.abs(spread) <= 1.0).all()
     if role == "direction":
-        np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(spread, axis=1), 1.0, atol=1e-3)
     other = np.random.default_rng(0).normal(size=(200, size))
     other = other / np.linalg.norm(other, axis=1)[:, None] if role == "direction" else np.clip(0.4 * other, -1, 1)
-    nearest = np.linalg.norm(other[:, None] - places[None], axis=2).min(axis=1)
+    nearest = np.linalg.norm(other[:, None] - spread[None], axis=2).min(axis=1)
     assert nearest.max() < farthest
+    point = places.points(made, ["place"])[3]
+    np.testing.assert_allclose(places.coordinates_of(made, ["place"], {"place": spread[3]}), point, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("shape", "views"), [((8, 8), 2), ((40, 30), 2)])

@@ -19,13 +19,14 @@ from unrender.methods.smoothed import SIGMA_HELP
 if TYPE_CHECKING:
     from unrender.estimators.base import Estimator
     from unrender.methods.plan import Plan
-    from unrender.methods.rules import exchangeable, paths, starts, traits
+    from unrender.methods.rules import exchangeable, paths, places, starts, traits
     from unrender.optimizers.base import Optimizer
     from unrender.scene import render
     from unrender.scene.problem import Problem
 else:  # options are checked without Dr.Jit
     exchangeable, paths = lazy.modules("methods.rules.exchangeable", "methods.rules.paths")
-    starts, traits = lazy.modules("methods.rules.starts", "methods.rules.traits")
+    places, starts = lazy.modules("methods.rules.places", "methods.rules.starts")
+    traits = lazy.Module("methods.rules.traits")
     render = lazy.Module("scene.render")
 
 
@@ -104,10 +105,13 @@ class AutoMethod(Options):
         known = traits.Traits(problem, self, CONSTANTS)
         plan = next(plan for rule in paths.RULES if (plan := rule(known)) is not None)
         plan = replace(plan, reasons=(*plan.reasons, *known.notes, *exchangeable.exchangeable(known)))
-        few = known.elements <= CONSTANTS.few_numbers
-        if few and any(starts.starts_at_bound(problem, key) for key in known.infos):
-            plan = starts.best_start(known, list(known.infos), plan)
-        plan = replace(plan, other_starts=tuple(starts.varied_keys(problem, list(known.infos)))) if few else plan
+        keys = list(known.infos)
+        if known.elements <= CONSTANTS.few_numbers:
+            plan = replace(plan, other_starts=tuple(places.varied_keys(problem, keys)))
+            by_paths = isinstance(plan.estimator, estimators.PathGradient | estimators.PathThenNewton)
+            far = by_paths and any(places.is_scale(problem, key) for key in plan.other_starts)
+            if far or any(places.starts_at_bound(problem, key) for key in keys):
+                plan = starts.best_start(known, keys, plan)
         shorter = self._shorter(plan, 0.0)
         return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan
 

@@ -13,7 +13,7 @@ from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods.base import measure
 from unrender.methods.plan import Plan
-from unrender.methods.rules.exchangeable import owner
+from unrender.methods.rules import places
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations import Bounds
 from unrender.scene.bounds import ends_of
@@ -22,11 +22,12 @@ from unrender.scene.problem import Problem
 from unrender.statistics.debiased import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
-_PER_DIMENSION, _MOST_PLACES, _MOST_POSES = 16, 24, 48
-"""Number of compared places per dimension, and maximum number in all dimensions together; the latter for the pose of a shape."""
 _NEAR = 16  # number of places around the best pose of a shape
-_FAR = 4.0  # largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)
-_OPEN = 5.0  # range of places above the only bound of numbers that start at it; k of most metals is below 5
+_DESCENTS, _OF_MEDIA, _FEWER = 8, 4, 2
+"""Number of places from which such numbers descend; the same for numbers of media, whose pictures take long; ratio of the paths of other
+comparisons to those of a picture for it."""
+_DIFFERENCE, _DAMPING, _LONGEST, _SHORTER = 0.02, 0.01, 0.25, 0.3
+"""Differences and damping of these descents, their longest step relative to the range, and its factor where the loss rises."""
 _PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
@@ -55,7 +56,7 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
         plateau: Whether the unknowns are poses on a plateau, where any better picture is enough.
     """
     problem = plan.configured()
-    varied = [key for key in varied_keys(problem, keys) if plateau or not _is_shape(problem, key)]
+    varied = [key for key in places.varied_keys(problem, keys) if plateau or not places.is_shape(problem, key)]
     lights = [key for key in traits.lights if key in keys]
     colours = any(traits.infos[key].brightness == "reflectance" for key in keys)
     if not varied or (colours and not plateau):
@@ -108,8 +109,14 @@ def better_place(
     limits = _limits([(values[key], unknowns[key].bounds) for key in lights])
     comparison = _Comparison(problem, pictures, values, keys, lights, limits)
     first = best = _Compared({}, 1.0, comparison.losses([values])[0][0])
-    for group in _groups(problem, keys):
-        best = comparison.best_of_group(group, best)
+    for group in places.groups(problem, keys):
+        if any(places.is_scale(problem, key) for key in group):
+            if best.total <= 0.0:
+                continue
+            rough = replace(comparison, pictures=FreshPictures(problem, 0, pictures.paths / _FEWER, _NUMBER))
+            best = min(comparison.compared(rough.descended(group, best)), best, key=lambda each: each.total)
+        else:
+            best = comparison.best_of_group(group, best)
     start = first.total
     share = max(best.total, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
     change = difference(best.losses, first.losses, sampled=pictures.sampled or not plateau)
@@ -135,6 +142,18 @@ class _Compared:
 
 
 @dataclass(frozen=True)
+class _Descent:
+    """A place, and its point of the unit cube."""
+
+    x: np.ndarray
+    at: _Compared
+
+    def total(self) -> float:
+        """Return the loss of the place, without the picture's noise; infinite for a picture that is not finite."""
+        return self.at.total if math.isfinite(self.at.total) else math.inf
+
+
+@dataclass(frozen=True)
 class _Comparison:
     """Pictures of places of varied unknowns `keys`, and limits of the common factor of the `lights`."""
 
@@ -151,19 +170,19 @@ class _Comparison:
         Places around the best pose of a shape are compared, too, because few of the spread ones overlap its picture in the references.
         """
         problem, before, at = self.problem, best, np.empty(0)
-        shape = _is_shape(problem, keys[0])
-        points = _points(problem, keys)
+        shape = places.is_shape(problem, keys[0])
+        points = places.points(problem, keys)
         reach = len(points) ** (-1.0 / points.shape[1])
         for _ in range(2 if shape else 1):
-            places = [{**before.place, **_values(problem, keys, point, self.values)} for point in points]
-            together = len(places) if shape else 1
-            for start in range(0, len(places), together):
+            tried = [{**before.place, **places.values_at(problem, keys, point, self.values)} for point in points]
+            together = len(tried) if shape else 1
+            for start in range(0, len(tried), together):
                 part = slice(start, start + together)
                 try:
-                    losses = self.losses([{**self.values, **place} for place in places[part]])
+                    losses = self.losses([{**self.values, **place} for place in tried[part]])
                 except InputError:  # a value that the renderer rejects
                     continue
-                for place, point, (own, factor) in zip(places[part], points[part], losses, strict=True):
+                for place, point, (own, factor) in zip(tried[part], points[part], losses, strict=True):
                     if (made := _Compared(place, factor, own)).total < best.total:
                         best, at = made, point
             if best is before:
@@ -171,6 +190,69 @@ class _Comparison:
             points = np.clip(at + reach * (2.0 * points[:_NEAR] - 1.0), 0.0, 1.0)
         change = difference(best.losses, before.losses, sampled=self.pictures.sampled)
         return best if not shape or change.value > _ERRORS * change.standard_error else before
+
+    def compared(self, state: _Compared) -> _Compared:
+        """Return the same place with the losses of these pictures."""
+        ((losses, factor),) = self.losses([{**self.values, **state.place}])
+        return _Compared(state.place, factor, losses)
+
+    def descended(self, keys: Sequence[str], best: _Compared) -> _Compared:
+        """Return the end of least squares from the given values or the best of the places, whichever has the least loss.
+
+        Places in a wide range are far apart, and the best of them often lies beside another minimum. So several of them take a step, then
+        half as many of the best that have not ended, and so on, until a picture differs from the references by noise alone.
+        """
+        descents, given = [], {**self.values, **best.place}
+        for x in [places.coordinates_of(self.problem, keys, given), *places.points(self.problem, keys)]:
+            place = {**best.place, **places.values_at(self.problem, keys, x, self.values)} if descents else best.place
+            try:
+                ((losses, factor),) = self.losses([{**self.values, **place}])
+            except InputError:  # a value that the renderer rejects
+                continue
+            descents.append(_Descent(x, _Compared(place, factor, losses)))
+        waiting, ended = [*descents[:1], *sorted(descents[1:], key=_Descent.total)], []
+        number = _descents(self.problem, keys)
+        while number:
+            chosen, waiting = waiting[:number], waiting[number:]
+            for each in chosen:
+                after = self._stepped(keys, each)
+                (ended if after is each else waiting).append(after)
+            waiting.sort(key=_Descent.total)
+            best_so_far = min([*waiting[:1], *ended], key=_Descent.total)
+            number = number // 2 if best_so_far.total() > 0.0 else 0
+        return best_so_far.at
+
+    def _stepped(self, keys: Sequence[str], descent: _Descent) -> _Descent:
+        """Return the place after a step of least squares; the same place if no step lowers the loss."""
+        problem, pictures, x, at = self.problem, self.pictures, descent.x, descent.at
+
+        def moved(point: np.ndarray) -> dict[str, np.ndarray]:
+            return {**at.place, **places.values_at(problem, keys, point, self.values)}
+
+        def images(place: Mapping[str, np.ndarray], factor: float = at.factor) -> np.ndarray:
+            lights = {key: factor * self.values[key] for key in self.lights}
+            return np.concatenate(pictures.images({**self.values, **place, **lights}), axis=1)
+
+        try:
+            image, columns = images(at.place), []
+            for change in np.where(x < 0.5, _DIFFERENCE, -_DIFFERENCE) * np.eye(x.size):
+                columns.append((images(moved(x + change)) - image) / change.sum())
+            if self.lights:  # their factor is fitted at the end of the step
+                columns.append(images(at.place, 2.0 * at.factor) - image)
+            halves = [np.stack([column[half::2].mean(axis=0) for column in columns]) for half in (0, 1)]
+            missing = [pictures.references - image[half::2].mean(axis=0) for half in (0, 1)]
+            matrix, vector = normal_equations(halves, missing, pictures.weights[:, None])
+            damped = matrix + _DAMPING * np.diag(np.abs(np.diag(matrix)))
+            step = np.linalg.lstsq(damped, vector)[0][: x.size]
+            step *= min(1.0, _LONGEST / np.abs(step).max())
+            for share in (1.0, _SHORTER):
+                point = np.clip(x + share * step, 0.0, 1.0)
+                after = self.compared(replace(at, place=moved(point)))
+                if after.total < at.total:
+                    return _Descent(point, after)
+        except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects
+            pass
+        return descent
 
     def losses(self, states: Sequence[Mapping[str, np.ndarray]]) -> list[tuple[np.ndarray, float]]:
         """Return the pseudo-values of the loss of each state, (K, N), and the factor of its lights: 1 or that of least squares, whichever
@@ -199,13 +281,13 @@ def stands_out(problem: Problem, keys: Sequence[str]) -> bool:
     """
     pictures, known = FreshPictures(problem, 0, _PATHS, _NUMBER), problem.renderer.parameters()
     values = {key: unknown.initial for key, unknown in problem.unknowns.items()}
-    places = [values]
+    states = [values]
     for key in keys:
         own, distance = values[key], 1.0 if known[key].angle else known[key].length
         for change in distance * np.concatenate([np.eye(own.size), -np.eye(own.size)]):
             moved = problem.unknowns[key].project(own + change.reshape(own.shape))
-            places.append({**values, key: np.asarray(moved, np.float32)})
-    first, *others = (pictures.losses(images) for images in pictures.images_of(places, keys))
+            states.append({**values, key: np.asarray(moved, np.float32)})
+    first, *others = (pictures.losses(images) for images in pictures.images_of(states, keys))
     worse = 0
     for other in others:
         rise = difference(first, other, sampled=pictures.sampled)
@@ -214,101 +296,21 @@ def stands_out(problem: Problem, keys: Sequence[str]) -> bool:
     return 2 * worse >= len(others) > 0
 
 
-def varied_keys(problem: Problem, keys: Sequence[str]) -> list[str]:
-    """Return the keys of unknowns whose places can be compared: directions, and numbers between two bounds that change the form of
-    the picture."""
-    return [key for key in keys if _dimensions(problem, key)]
-
-
 def number_of_places(problem: Problem, keys: Sequence[str]) -> int:
-    """Return how many places `better_place` compares at most."""
-    groups = _groups(problem, keys)
-    return sum(len(_points(problem, group)) + _NEAR * _is_shape(problem, group[0]) for group in groups)
+    """Return how many pictures `better_place` renders at most, without those of lights."""
+    total = 0
+    for group in places.groups(problem, keys):
+        points = places.points(problem, group)
+        if any(places.is_scale(problem, key) for key in group):
+            total += (len(points) + 2 * _descents(problem, group) * (points.shape[1] + 3)) // _FEWER + 1
+        else:
+            total += len(points) + _NEAR * places.is_shape(problem, group[0])
+    return total
 
 
-def starts_at_bound(problem: Problem, key: str) -> bool:
-    """Return whether all values of an unknown that is no pose, brightness or density start at its only bound, a lower one."""
-    unknown, info = problem.unknowns[key], problem.renderer.parameters()[key]
-    low, high = unknown.bounds
-    other = info.rigid or info.viewpoint or info.brightness or info.scattering == "medium"
-    return not other and low is not None and high is None and bool((unknown.initial == low).all())
-
-
-def _dimensions(problem: Problem, key: str) -> int:
-    """Return the number of dimensions in which places of an unknown are compared; 0 for none."""
-    info, unknown = problem.renderer.parameters()[key], problem.unknowns[key]
-    if unknown.prior is not None or unknown.transform is not None:
-        return 0
-    if info.role == "direction":
-        return 2 if unknown.shape() == (3,) else 0
-    formed = not info.viewpoint if info.rigid else info.nonlinear or info.scattering or starts_at_bound(problem, key)
-    return unknown.initial.size if formed and None not in _range(problem, key, 0.0) else 0
-
-
-def _is_shape(problem: Problem, key: str) -> bool:
-    return problem.renderer.parameters()[key].shape_pose
-
-
-def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
-    """Return the keys whose places are compared together: those of each shape, and all others."""
-    groups: dict[str, list[str]] = {}
-    for key in keys:
-        groups.setdefault(owner(key) if _is_shape(problem, key) else "", []).append(key)
-    return list(groups.values())
-
-
-def _range(problem: Problem, key: str, value: float) -> Bounds:
-    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value.
-
-    Numbers that start at their only bound, a lower one, have a range above it. Pictures may hardly change there: those of a metal are even
-    functions of k.
-    """
-    bounds, info = problem.unknowns[key].bounds, problem.renderer.parameters()[key]
-    if starts_at_bound(problem, key):
-        low = ends_of(bounds)[0]
-        return low, low + _OPEN
-    if bounds != (None, None) or not info.rigid:
-        return bounds
-    if info.angle:
-        return -math.pi, math.pi
-    far = _FAR * info.length
-    return (value - far, value + far) if _is_shape(problem, key) and info.lowest is None else bounds
-
-
-def _points(problem: Problem, keys: Sequence[str]) -> np.ndarray:
-    """Return well-spread points of the unit cube (Roberts' additive sequence), (N, D)."""
-    total = sum(_dimensions(problem, key) for key in keys)
-    golden = 2.0
-    for _ in range(64):  # the root of x^(d + 1) = x + 1
-        golden = (1.0 + golden) ** (1.0 / (total + 1.0))
-    most = _MOST_POSES if _is_shape(problem, keys[0]) else _MOST_PLACES
-    number = np.arange(1, min(_PER_DIMENSION * total, most) + 1)[:, None]
-    return (0.5 + number * golden ** -np.arange(1.0, total + 1.0)) % 1.0
-
-
-def _values(
-    problem: Problem, keys: Sequence[str], point: np.ndarray, around: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Return {key: value} of some unknowns at a point of the unit cube."""
-    ends = np.cumsum([_dimensions(problem, key) for key in keys])
-    return {
-        key: _value(problem, key, part, around[key]) for key, part in zip(keys, np.split(point, ends[:-1]), strict=True)
-    }
-
-
-def _value(problem: Problem, key: str, point: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Return the value of an unknown at a point of the unit cube. Without bounds, places are denser near the given value."""
-    unknown, info = problem.unknowns[key], problem.renderer.parameters()[key]
-    if info.role == "direction":
-        z, angle = 2.0 * point[0] - 1.0, 2.0 * math.pi * point[1]
-        side = math.sqrt(1.0 - z * z)
-        value = np.array([side * math.cos(angle), side * math.sin(angle), z])
-    elif _is_shape(problem, key) and unknown.bounds == (None, None) and not info.angle:
-        value = around + _FAR * info.length * (2.0 * point.reshape(unknown.initial.shape) - 1.0) ** 3
-    else:
-        low, high = (float(end or 0.0) for end in _range(problem, key, 0.0))
-        value = (low + (high - low) * point).reshape(unknown.initial.shape)
-    return np.asarray(unknown.project(value), np.float32)
+def _descents(problem: Problem, keys: Sequence[str]) -> int:
+    known = problem.renderer.parameters()
+    return _OF_MEDIA if any(known[key].scattering == "medium" for key in keys) else _DESCENTS
 
 
 def _limits(lights: Sequence[tuple[np.ndarray, Bounds]]) -> Bounds:
