@@ -66,8 +66,8 @@ def unfinished(run: Run) -> list[str]:
     if isinstance(estimator, HybridGradient) and 0 < run.step <= estimator.wait:
         block = estimator.keys or beyond_paths(run.problem.renderer.parameters(), list(run.parameters))
         lines.append(
-            f"{listed(list(block))}: still at the initial values after {run.step} steps, since the first {estimator.wait} "
-            "are steps of the others; use more steps or seconds"
+            f"{listed(list(block))}: still at the initial values after {run.step} step{'s' * (run.step != 1)}, since the first "
+            f"{estimator.wait} are steps of the others; use more steps or seconds"
         )
     for key, levels in run.problem.coarse_to_fine.items():
         if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and levels.steps[-1] < NEVER:
