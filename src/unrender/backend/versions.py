@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import re
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -13,13 +14,9 @@ from unrender.backend.limits import cores, first_line
 from unrender.backend.variant import current, llvm_version
 
 
-def versions() -> dict[str, str]:
-    """Return {name: version} of Python and of the packages on which the numbers depend; "not installed" for a missing one."""
-    return dict(_versions())
-
-
 @cache
-def _versions() -> dict[str, str]:
+def versions() -> Mapping[str, str]:
+    """Return {name: version} of Python and of the packages on which the numbers depend; "not installed" for a missing one."""
     versions_by_package = {"python": platform.python_version()}
     for package in ("unrender", "mitsuba", "drjit", "numpy"):
         try:
@@ -43,13 +40,9 @@ def _deciding_versions(name: str) -> dict[str, str]:
     return {**versions_by_package, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
 
 
-def hardware() -> dict[str, Any]:
-    """Return the processor, the number of cores that this process may use, and the operating system: keys processor, cores, system."""
-    return dict(_hardware())
-
-
 @cache
-def _hardware() -> dict[str, Any]:
+def hardware() -> Mapping[str, Any]:
+    """Return the processor, the number of cores that this process may use, and the operating system: keys processor, cores, system."""
     return {"processor": processor(), "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
