@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
+from unrender.core import phases
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
 from unrender.losses.metrics import rmse
@@ -56,7 +57,8 @@ def execution(
     problem: Problem, order: RunOrder, directory: Path, console: Console, progress: Progress
 ) -> Iterator[dict[str, Any]]:
     """Print the plan and yield the arguments of `optimize`, which writes a run folder. Remove live files if the block succeeds."""
-    plan = order.method.plan(problem, order.settings)
+    with phases.phase("planning"):
+        plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
         console.say(f"{order.method.name}: {line}")
     options = order.method.options_of(order.settings)
