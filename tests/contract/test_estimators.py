@@ -273,7 +273,8 @@ def test_the_truth_is_recovered(estimator: str, optimizer: str) -> None:
     assert found.skipped == 0
     # the result may be that of an earlier step, or not all the way there: .4 of the error at the start is enough here
     expected = ("the final picture is worse than that of step", DIFFERS)
-    assert [line for line in found.warnings if not line.startswith(expected)] == []
+    short = "are too few to judge"  # steps that a trust region still limits
+    assert [line for line in found.warnings if not line.startswith(expected) and short not in line] == []
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
