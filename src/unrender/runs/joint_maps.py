@@ -47,8 +47,8 @@ _BLURRED, _SEEN = 4.0, 0.005
 _STREAM, _LAUNCHES, _RENDERINGS = 9, 4, 4
 """Stream of the random numbers, adjoints of each change, and samples of a rendering of the joint change relative to those of a part."""
 _MOST_FACTOR, _OF_AGAIN = 16, 8.0
-"""Largest factor of the number of samples, which becomes four times as large; time left, relative to the time of a surface so far, for
-the next one."""
+"""Largest factor of the number of samples, which becomes four times as large; time that must be left, relative to that of the last test of
+a surface."""
 
 
 def hidden_changes(
@@ -66,22 +66,24 @@ def hidden_changes(
         seconds: time limit of the tests of all surfaces together.
         per_pass: see `render`.
     """
-    lines, until, surfaces = [], timing.now() + seconds, [*_surfaces(problem)]
-    for index, keys in enumerate(surfaces):
-        started, factor, left = timing.now(), 1, until - timing.now()
-        try:
-            own = _Surface(problem, values, keys, spp, per_pass).line(left)
-            while (
-                not own
-                and factor < _MOST_FACTOR
-                and _OF_AGAIN * (timing.now() - started) * (len(surfaces) - index) < left
-            ):
-                factor *= 4
-                own = _Surface(problem, values, keys, factor * spp, per_pass, factor).line(math.inf)
-        except InputError:  # the renderer rejects a value
-            continue
-        lines += own
-    return lines
+    until, surfaces, factor = timing.now() + seconds, [*_surfaces(problem)], 1
+    lines, spent = [list[str]() for _ in surfaces], [0.0] * len(surfaces)
+    pending = [*range(len(surfaces))]
+    while pending and factor <= _MOST_FACTOR:
+        tested, pending = pending, []
+        for index in tested:
+            started = timing.now()
+            if factor > 1 and _OF_AGAIN * spent[index] > until - started:
+                continue
+            surface = _Surface(problem, values, surfaces[index], factor * spp, per_pass, factor)
+            try:
+                lines[index] = surface.line(until - started if factor == 1 else math.inf)
+            except InputError:  # the renderer rejects a value
+                continue
+            spent[index] = timing.now() - started
+            pending += [index] * (not lines[index])
+        factor *= 4
+    return [line for own in lines for line in own]
 
 
 def blurred_cells(
