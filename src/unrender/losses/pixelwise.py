@@ -117,7 +117,7 @@ class Censored:
 
     def __post_init__(self):
         checks.fields(self)
-        if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
+        if not getattr(self.loss, "pixelwise", False):
             raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {in_words(self.loss)}")
 
     def value(self, image: Array, reference: Array) -> Array:
