@@ -53,6 +53,23 @@ def test_a_meter_of_one_pixel_has_enough_samples() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("focus", "aperture", "again"), [(20.0, 0.9, True), (6.0, 0.2, False)])
+def test_a_lens_leaves_a_second_minimum_and_no_first_one(focus: float, aperture: float, again: bool) -> None:
+    """From a focus distance four times too far it ended at 12.5 without a word."""
+    made, truth, _, _ = lens()
+    reference = np.array(
+        mi.render(mi.load_dict(made), integrator=mi.load_dict({"type": "path", "max_depth": 6}), spp=1024)
+    )
+    start = dict(zip(truth, (focus, aperture), strict=True))
+    unknown = [ur.Parameter(key, initial=x) for key, x in start.items()]
+    problem = ur.Problem(made, unknown, [ur.View(reference)], max_depth=6, truth=truth)
+    result = ur.optimize(problem, steps=40, progress=False)
+    assert any(line.startswith("begins again") for line in result.adapted) is again
+    for key, x in truth.items():
+        assert result.parameters[key] == pytest.approx(x, rel=0.03), key
+
+
+@pytest.mark.slow
 def test_a_metal_that_starts_without_absorption_gets_its_own() -> None:
     """k = 0 is a second minimum where η < 1, since metals reflect nearly all light there: red ended at 0.0085 ± 0.0074 in silence."""
     truth = [3.9, 2.4, 2.1]

@@ -11,7 +11,7 @@ import pytest
 
 from tests.analytic import AnalyticRenderer
 from unrender import losses
-from unrender.estimators import PathGradient
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import exchangeable, places, starts
@@ -138,12 +138,12 @@ def test_positive_numbers_descend_from_places_of_other_magnitudes(
     made = problem(monkeypatch, [12.0, 1.0], (0.0, None), lamp=lamp)
     if not descends:
         monkeypatch.setattr(starts._Comparison, "_stepped", lambda self, keys, descent: descent)
-    plan = method("auto").plan(made)
-    begun = first(plan)
-    assert bool(np.linalg.norm(begun["place"] - TRUTH["place"]) < 0.2) is descends
-    assert plan.other_starts == ("place",)
-    if descends:
-        assert begun["lamp"] == pytest.approx(4.0, rel=0.1)
+    pictures, judged = (FreshPictures(made, 0, paths, 3) for paths in (1 << 13, 1 << 15))
+    found = starts.better_place(made, pictures, made.initial_values(), ["place"], ["lamp"], judged=judged)
+    assert found is not None
+    assert bool(np.linalg.norm(found.values["place"] - TRUTH["place"]) < 0.3) is descends
+    if descends and lamp != 4.0:
+        assert found.values["lamp"] == pytest.approx(4.0, rel=0.1)
     for x in ([0.5, 0.5], [0.1, 0.9]):
         values = places.values_at(made, ["place"], np.array(x), made.initial_values())
         np.testing.assert_allclose(places.coordinates_of(made, ["place"], values), x, rtol=1e-5)
@@ -153,13 +153,11 @@ def test_positive_numbers_descend_from_places_of_other_magnitudes(
     assert places.coordinates_of(made, ["place"], {"place": np.zeros(2)}).tolist() == [0.0, 0.0]
 
 
-def test_path_gradients_of_positive_numbers_start_at_the_best_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An extinction that started ten times too small took 24 of 48 steps before it moved."""
-    made = problem(monkeypatch, [12.0, 1.0], (0.0, None), brightness="", nonlinear=False, scattering="medium")
-    made = Problem(made.renderer, made.parameters, made.views, losses.L1())
-    plan = method("auto").plan(made)
-    assert isinstance(plan.estimator, PathGradient)
-    np.testing.assert_allclose(first(plan)["place"], TRUTH["place"], atol=0.2)
+def test_positive_numbers_start_at_their_initial_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise of the first pictures chose another minimum for a focus distance a fifth too far."""
+    plan = method("auto").plan(problem(monkeypatch, [12.0, 1.0], (0.0, None)))
+    assert plan.other_starts == ("place",)
+    np.testing.assert_allclose(first(plan)["place"], [12.0, 1.0])
 
 
 @pytest.mark.parametrize(

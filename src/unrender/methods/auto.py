@@ -108,9 +108,7 @@ class AutoMethod(Options):
         keys = list(known.infos)
         if known.elements <= CONSTANTS.few_numbers:
             plan = replace(plan, other_starts=tuple(places.varied_keys(problem, keys)))
-            by_paths = isinstance(plan.estimator, estimators.PathGradient | estimators.PathThenNewton)
-            far = by_paths and any(places.is_scale(problem, key) for key in plan.other_starts)
-            if far or any(places.starts_at_bound(problem, key) for key in keys):
+            if any(places.starts_at_bound(problem, key) for key in keys):
                 plan = starts.best_start(known, keys, plan)
         shorter = self._shorter(plan, 0.0)
         return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan

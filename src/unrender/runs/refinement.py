@@ -18,6 +18,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.estimators.hybrid import HybridGradient, HybridState, beyond_paths
+from unrender.methods.rules.places import is_scale
 from unrender.methods.rules.starts import Place, better_place, number_of_places
 from unrender.methods.rules.turns import better_turn, number_of_turns, turned_keys
 from unrender.optimizers.partitioned import Partitioned
@@ -33,6 +34,7 @@ from unrender.runs.verification import misfit_of_numbers
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import NotCarried, Upsampler, restarted, upsampled
+from unrender.statistics.paired_losses import mean_and_error
 
 if TYPE_CHECKING:
     from unrender.runs.run import Run
@@ -207,10 +209,12 @@ class MeshRefinement(Callback):
 
 
 _USED, _FEWEST_STEPS = 0.4, 16  # fraction of the budget, and number of steps, after which values are compared once
-_SHARE, _LEAST_PATHS, _MOST_SHARE = 0.5, 1 << 14, 2.5
-"""Paths of all pictures relative to the run's so far, the least number of one, and the share above which a short run is not compared."""
+_SHARE, _SHARE_OF_SCALES, _JUDGED, _MOST_SHARE, _LEAST_PATHS = 0.5, 1.0, 1 / 16, 2.5, 1 << 14
+"""Paths relative to the run's so far: of all pictures, the same for scales, of one that decides, and above which a short run is not
+compared; least number of paths of a picture."""
 BEGUN_AGAIN = "begins again after step"
 """First words of the line about other values."""
+_ERRORS = 4.0  # standard errors of the loss of scales, above which they are compared
 _NUMBER, _KEPT = 4, "kept"  # index of the set of random numbers; outcome of a comparison without a better place
 
 
@@ -231,7 +235,8 @@ class OtherStart(Callback):
             return
         rotations = turned_keys(run.problem, keys) if isinstance(run.optimizer, Partitioned) else ()
         places = number_of_turns(run.problem, rotations) if rotations else number_of_places(run.problem, keys)
-        paths = max(_SHARE / places * state.samples, _LEAST_PATHS)
+        share = _SHARE_OF_SCALES if any(is_scale(run.problem, key) for key in keys) else _SHARE
+        paths = max(share / places * state.samples, _LEAST_PATHS)
         pictures = FreshPictures(run.problem, run.seed, paths, _NUMBER)
         if run.problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
@@ -245,11 +250,15 @@ class OtherStart(Callback):
 def _moved(run: Run, pictures: FreshPictures) -> str:
     """Begin again at other values with a much better picture. Returns a line about them, or ""."""
     problem, values, keys = run.problem, run.full(), run.plan.other_starts
-    if not misfit_of_numbers(problem, pictures.compare(pictures.picture(values).images)):
+    judged = FreshPictures(problem, run.seed, max(_JUDGED * run.state.samples, pictures.paths), _NUMBER)
+    images = judged.images(values)
+    loss, error = mean_and_error(judged.losses(images))
+    clear = any(is_scale(problem, key) for key in keys) and loss > _ERRORS * error
+    if not clear and not misfit_of_numbers(problem, judged.compare(images)):
         return ""
     known = problem.renderer.parameters()
     lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]
-    if not (place := better_place(problem, pictures, values, keys, lights)):
+    if not (place := better_place(problem, pictures, values, keys, lights, judged=judged)):
         return ""
     before = run.state.estimator
     begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})

@@ -23,9 +23,9 @@ from unrender.statistics.debiased import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
 _NEAR = 16  # number of places around the best pose of a shape
-_DESCENTS, _OF_MEDIA, _FEWER = 8, 4, 2
-"""Number of places from which such numbers descend; the same for numbers of media, whose pictures take long; ratio of the paths of other
-comparisons to those of a picture for it."""
+_DESCENTS, _OF_MEDIA, _JUDGED = 8, 4, 3
+"""Number of places from which such numbers descend; the same for numbers of media, whose pictures take long; number of ends that are
+compared."""
 _DIFFERENCE, _DAMPING, _LONGEST, _SHORTER = 0.02, 0.01, 0.25, 0.3
 """Differences and damping of these descents, their longest step relative to the range, and its factor where the loss rises."""
 _PATHS, _NUMBER = 1 << 15, 3  # paths of one picture, and index of their random numbers
@@ -56,7 +56,9 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
         plateau: Whether the unknowns are poses on a plateau, where any better picture is enough.
     """
     problem = plan.configured()
-    varied = [key for key in places.varied_keys(problem, keys) if plateau or not places.is_shape(problem, key)]
+    # A descent from near values arrives, where noise of these pictures may choose another minimum: scales wait for `OtherStart`.
+    varied = [key for key in places.varied_keys(problem, keys) if not places.is_scale(problem, key)]
+    varied = [key for key in varied if plateau or not places.is_shape(problem, key)]
     lights = [key for key in traits.lights if key in keys]
     colours = any(traits.infos[key].brightness == "reflectance" for key in keys)
     if not varied or (colours and not plateau):
@@ -90,6 +92,7 @@ def better_place(
     keys: Sequence[str],
     lights: Sequence[str],
     plateau: bool = False,
+    judged: FreshPictures | None = None,
 ) -> Place | None:
     """Return the best of some places within the bounds of unknowns; None unless its loss is at most half, beyond noise.
 
@@ -103,20 +106,22 @@ def better_place(
         keys: Keys of the varied unknowns, see `varied_keys`.
         lights: Keys of radiances and other values in which images are linear.
         plateau: Whether any smaller loss is enough, beyond noise.
+        judged: Renderer of the pictures by which the best place is compared with the given values; None for `pictures`.
     """
     unknowns = problem.unknowns
     lights = [key for key in lights if unknowns[key].prior is None]
     limits = _limits([(values[key], unknowns[key].bounds) for key in lights])
     comparison = _Comparison(problem, pictures, values, keys, lights, limits)
+    judge = replace(comparison, pictures=judged or pictures)
     first = best = _Compared({}, 1.0, comparison.losses([values])[0][0])
     for group in places.groups(problem, keys):
         if any(places.is_scale(problem, key) for key in group):
-            if best.total <= 0.0:
-                continue
-            rough = replace(comparison, pictures=FreshPictures(problem, 0, pictures.paths / _FEWER, _NUMBER))
-            best = min(comparison.compared(rough.descended(group, best)), best, key=lambda each: each.total)
+            found = [judge.compared(each) for each in (best, *comparison.descended(group, best))]
+            best = comparison.compared(min(found, key=lambda each: each.total))
         else:
             best = comparison.best_of_group(group, best)
+    if judged is not None:
+        first, best = judge.compared(first), judge.compared(best)
     start = first.total
     share = max(best.total, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
     change = difference(best.losses, first.losses, sampled=pictures.sampled or not plateau)
@@ -196,11 +201,11 @@ class _Comparison:
         ((losses, factor),) = self.losses([{**self.values, **state.place}])
         return _Compared(state.place, factor, losses)
 
-    def descended(self, keys: Sequence[str], best: _Compared) -> _Compared:
-        """Return the end of least squares from the given values or the best of the places, whichever has the least loss.
+    def descended(self, keys: Sequence[str], best: _Compared) -> list[_Compared]:
+        """Return the ends of least squares from the given values and from the best of the places that have the least loss.
 
         Places in a wide range are far apart, and the best of them often lies beside another minimum. So several of them take a step, then
-        half as many of the best that have not ended, and so on, until a picture differs from the references by noise alone.
+        half as many of the best that have not ended, and so on.
         """
         descents, given = [], {**self.values, **best.place}
         for x in [places.coordinates_of(self.problem, keys, given), *places.points(self.problem, keys)]:
@@ -218,9 +223,8 @@ class _Comparison:
                 after = self._stepped(keys, each)
                 (ended if after is each else waiting).append(after)
             waiting.sort(key=_Descent.total)
-            best_so_far = min([*waiting[:1], *ended], key=_Descent.total)
-            number = number // 2 if best_so_far.total() > 0.0 else 0
-        return best_so_far.at
+            number //= 2
+        return [each.at for each in sorted([*waiting, *ended], key=_Descent.total)[:_JUDGED]]
 
     def _stepped(self, keys: Sequence[str], descent: _Descent) -> _Descent:
         """Return the place after a step of least squares; the same place if no step lowers the loss."""
@@ -302,7 +306,7 @@ def number_of_places(problem: Problem, keys: Sequence[str]) -> int:
     for group in places.groups(problem, keys):
         points = places.points(problem, group)
         if any(places.is_scale(problem, key) for key in group):
-            total += (len(points) + 2 * _descents(problem, group) * (points.shape[1] + 3)) // _FEWER + 1
+            total += len(points) + 2 * _descents(problem, group) * (points.shape[1] + 3)
         else:
             total += len(points) + _NEAR * places.is_shape(problem, group[0])
     return total
