@@ -107,7 +107,9 @@ class AutoMethod(Options):
         plan = replace(plan, reasons=(*plan.reasons, *known.notes, *exchangeable.exchangeable(known)))
         keys = list(known.infos)
         if known.elements <= CONSTANTS.few_numbers:
-            plan = replace(plan, other_starts=tuple(places.varied_keys(problem, keys)))
+            by_paths = isinstance(plan.estimator, estimators.PathGradient | estimators.PathThenNewton)
+            varied = [k for k in places.varied_keys(problem, keys) if not (by_paths and places.is_scale(problem, k))]
+            plan = replace(plan, other_starts=tuple(varied))
             if any(places.starts_at_bound(problem, key) for key in keys):
                 plan = starts.best_start(known, keys, plan)
         shorter = self._shorter(plan, 0.0)

@@ -223,7 +223,9 @@ class OtherStart(Callback):
 
     A descent ends in the nearest minimum. After 40 % of the budget, a new picture of few numbers is compared with the references. If they
     differ by more than noise, pictures of other values of `Plan.other_starts` are rendered. The run begins again at the best ones only if
-    their loss is at most half of that of the descent so far, beyond noise. A descent that arrives is therefore not disturbed.
+    their loss is at most half of that of the descent so far, beyond noise. A descent that arrives is therefore not disturbed. The loss
+    itself decides for positive numbers without an upper bound, such as an aperture, whose wrong pictures differ little: pictures with more
+    paths compare it with 0, and with that of the best other values.
 
     If a block of the unknowns (`Partitioned`) has rotations of shapes, other turns are compared instead, and any smaller loss is enough,
     beyond noise. The block begins again there; the other unknowns go on.
@@ -250,15 +252,16 @@ class OtherStart(Callback):
 def _moved(run: Run, pictures: FreshPictures) -> str:
     """Begin again at other values with a much better picture. Returns a line about them, or ""."""
     problem, values, keys = run.problem, run.full(), run.plan.other_starts
-    judged = FreshPictures(problem, run.seed, max(_JUDGED * run.state.samples, pictures.paths), _NUMBER)
+    scales, judged = any(is_scale(problem, key) for key in keys), pictures
+    if scales:
+        judged = FreshPictures(problem, run.seed, max(_JUDGED * run.state.samples, pictures.paths), _NUMBER)
     images = judged.images(values)
     loss, error = mean_and_error(judged.losses(images))
-    clear = any(is_scale(problem, key) for key in keys) and loss > _ERRORS * error
-    if not clear and not misfit_of_numbers(problem, judged.compare(images)):
+    if not (scales and loss > _ERRORS * error) and not misfit_of_numbers(problem, judged.compare(images)):
         return ""
     known = problem.renderer.parameters()
     lights = [k for k, u in problem.unknowns.items() if known[k].brightness == "light" and u.transform is None]
-    if not (place := better_place(problem, pictures, values, keys, lights, judged=judged)):
+    if not (place := better_place(problem, pictures, values, keys, lights, judged=judged if scales else None)):
         return ""
     before = run.state.estimator
     begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})
