@@ -13,7 +13,7 @@ import unrender as ur
 from benchmarks.shapes.lights import run as lights
 from tiers import quick
 from unrender.methods import method
-from unrender.methods.rules import newton, starts
+from unrender.methods.rules import newton, places
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -102,7 +102,7 @@ def test_auto_leaves_a_start_at_which_the_sun_lights_other_faces(
     plan = method("auto").plan(made)
     assert any(reason.startswith("starts at other values") for reason in plan.reasons)
     assert abs(float(np.ravel(plan.configured().start()["lamp.rotation.y"])[0])) < 0.3
-    monkeypatch.setattr(starts, "_PER_DIMENSION", 8)
+    monkeypatch.setattr(places, "_PER_DIMENSION", 8)
     planted = method("auto").plan(made)
     assert not any(reason.startswith("starts at other values") for reason in planted.reasons)
 
