@@ -18,7 +18,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.estimators.hybrid import HybridGradient, HybridState, beyond_paths
-from unrender.methods.rules.places import is_scale
+from unrender.methods.rules.places import has_scale
 from unrender.methods.rules.starts import Place, better_place, number_of_places
 from unrender.methods.rules.turns import better_turn, number_of_turns, turned_keys
 from unrender.optimizers.partitioned import Partitioned
@@ -237,7 +237,7 @@ class OtherStart(Callback):
             return
         rotations = turned_keys(run.problem, keys) if isinstance(run.optimizer, Partitioned) else ()
         places = number_of_turns(run.problem, rotations) if rotations else number_of_places(run.problem, keys)
-        share = _SHARE_OF_SCALES if any(is_scale(run.problem, key) for key in keys) else _SHARE
+        share = _SHARE_OF_SCALES if has_scale(run.problem, keys) else _SHARE
         paths = max(share / places * state.samples, _LEAST_PATHS)
         pictures = FreshPictures(run.problem, run.seed, paths, _NUMBER)
         if run.problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
@@ -252,7 +252,7 @@ class OtherStart(Callback):
 def _moved(run: Run, pictures: FreshPictures) -> str:
     """Begin again at other values with a much better picture. Returns a line about them, or ""."""
     problem, values, keys = run.problem, run.full(), run.plan.other_starts
-    scales, judged = any(is_scale(problem, key) for key in keys), pictures
+    scales, judged = has_scale(problem, keys), pictures
     if scales:
         judged = FreshPictures(problem, run.seed, max(_JUDGED * run.state.samples, pictures.paths), _NUMBER)
     images = judged.images(values)

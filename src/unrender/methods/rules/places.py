@@ -42,7 +42,7 @@ def dimensions(problem: Problem, key: str) -> int:
     if info.role == "direction":
         return 2 if unknown.shape() == (3,) else 0
     formed = not info.viewpoint if info.rigid else info.nonlinear or info.scattering or starts_at_bound(problem, key)
-    return unknown.initial.size if formed and (scale or None not in _range(problem, key, 0.0)) else 0
+    return unknown.initial.size if formed and (scale or None not in _range(problem, key)) else 0
 
 
 def is_scale(problem: Problem, key: str) -> bool:
@@ -51,6 +51,10 @@ def is_scale(problem: Problem, key: str) -> bool:
     low, high = unknown.bounds
     open_above = low is not None and high is None and not problem.renderer.parameters()[key].rigid
     return open_above and bool((unknown.initial > low).all())
+
+
+def has_scale(problem: Problem, keys: Sequence[str]) -> bool:
+    return any(is_scale(problem, key) for key in keys)
 
 
 def is_shape(problem: Problem, key: str) -> bool:
@@ -65,8 +69,8 @@ def groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
     return list(groups.values())
 
 
-def _range(problem: Problem, key: str, value: float) -> Bounds:
-    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value.
+def _range(problem: Problem, key: str) -> Bounds:
+    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths.
 
     Numbers that start at their only bound, a lower one, have a range above it. Pictures may hardly change there: those of a metal are even
     functions of k.
@@ -80,7 +84,7 @@ def _range(problem: Problem, key: str, value: float) -> Bounds:
     if info.angle:
         return -math.pi, math.pi
     far = _FAR * info.length
-    return (value - far, value + far) if is_shape(problem, key) and info.lowest is None else bounds
+    return (-far, far) if is_shape(problem, key) and info.lowest is None else bounds
 
 
 def points(problem: Problem, keys: Sequence[str]) -> np.ndarray:
@@ -118,7 +122,7 @@ def _value(problem: Problem, key: str, point: np.ndarray, around: np.ndarray) ->
         low = ends_of(unknown.bounds)[0]
         value = low + (unknown.initial - low) * _RATIO ** (2.0 * point.reshape(unknown.initial.shape) - 1.0)
     else:
-        low, high = (float(end or 0.0) for end in _range(problem, key, 0.0))
+        low, high = (float(end or 0.0) for end in _range(problem, key))
         value = (low + (high - low) * point).reshape(unknown.initial.shape)
     return np.asarray(unknown.project(value), np.float32)
 
@@ -136,6 +140,6 @@ def coordinates_of(problem: Problem, keys: Sequence[str], values: Mapping[str, n
             ratios = np.maximum(x - low, 1e-300) / (initial - low)
             parts.append(0.5 + 0.5 * np.log(ratios) / math.log(_RATIO))
         else:
-            low, high = (float(end or 0.0) for end in _range(problem, key, 0.0))
+            low, high = (float(end or 0.0) for end in _range(problem, key))
             parts.append((x - low) / (high - low))
     return np.clip(np.concatenate(parts), 0.0, 1.0)

@@ -115,9 +115,8 @@ def better_place(
     judge = replace(comparison, pictures=judged or pictures)
     first = best = _Compared({}, 1.0, comparison.losses([values])[0][0])
     for group in places.groups(problem, keys):
-        if any(places.is_scale(problem, key) for key in group):
-            found = [judge.compared(each) for each in (best, *comparison.descended(group, best))]
-            best = comparison.compared(min(found, key=lambda each: each.total))
+        if places.has_scale(problem, group):
+            best = min((best, *comparison.descended(group, best)), key=lambda place: judge.compared(place).total)
         else:
             best = comparison.best_of_group(group, best)
     if judged is not None:
@@ -301,11 +300,11 @@ def stands_out(problem: Problem, keys: Sequence[str]) -> bool:
 
 
 def number_of_places(problem: Problem, keys: Sequence[str]) -> int:
-    """Return how many pictures `better_place` renders at most, without those of lights."""
+    """Return how many of the pictures `better_place` renders at most, without those of lights. It judges few others."""
     total = 0
     for group in places.groups(problem, keys):
         points = places.points(problem, group)
-        if any(places.is_scale(problem, key) for key in group):
+        if places.has_scale(problem, group):
             total += len(points) + 2 * _descents(problem, group) * (points.shape[1] + 3)
         else:
             total += len(points) + _NEAR * places.is_shape(problem, group[0])
