@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
@@ -90,3 +91,28 @@ def test_a_picture_waits_for_another_thread_that_renders(tmp_path: Path) -> None
             order.append("read")
         thread.join()
     assert order == ["rendered", "read", "rendered"]
+
+
+def test_exr_files_are_refused_in_a_fork(tmp_path: Path) -> None:
+    """Workers of `multiprocessing` that start by `fork` waited for ever for threads that only their parent has. Other files need none."""
+    script = """
+import os, signal, sys
+import numpy as np
+import unrender as ur
+from unrender.io import images
+ur.use('llvm_ad_rgb')
+exr, png = sys.argv[1:]
+images.write(np.ones((4, 4, 3)), exr)
+if not (child := os.fork()):
+    signal.alarm(20)
+    status = int((images.read(png).values != 1).any())
+    try:
+        images.read(exr)
+    except ur.UnrenderError as error:
+        os._exit(status + 2 * ("get_context('spawn')" not in str(error)))
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    Image.new("RGB", (4, 4), "white").save(tmp_path / "one.png")
+    command = [sys.executable, "-c", script, *(str(tmp_path / name) for name in ("one.exr", "one.png"))]
+    done = subprocess.run(command, timeout=100, capture_output=True, text=True)
+    assert done.returncode == 0, done

@@ -108,7 +108,7 @@ def _picture_files() -> Files:
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     import mitsuba as mi
 
-    with variant.two_threads():
+    with variant.two_threads(place / "a.exr"):
         mi.Bitmap(pixels.astype(np.float32)).write(str(place / "a.exr"))
     return found | {"a.exr": (place / "a.exr").read_bytes()}
 

@@ -32,6 +32,7 @@ _INITIALISATION = 0.5  # maximum time in seconds that Dr.Jit takes to reject a l
 _THREADS = 4  # maximum number of threads per core
 
 _threads_limited = False
+_loading_process: int | None = None  # process of the first load, which has Dr.Jit's threads; forks inherit its number
 _setting = threading.RLock()  # Mitsuba's module attributes are incomplete while another thread sets the variant
 
 _TRIAL = """
@@ -201,17 +202,36 @@ def use_threads(count: int) -> None:
         dr.set_thread_count(count)
 
 
-@contextlib.contextmanager
-def two_threads() -> Iterator[None]:
-    """Give Dr.Jit at least two threads within this context: with one, Mitsuba's OpenEXR deadlocks on files.
+def _is_exr(file: Path) -> bool:
+    if file.suffix.lower() == ".exr" or not file.is_file():
+        return file.suffix.lower() == ".exr"
+    with file.open("rb") as handle:
+        return handle.read(4) == b"v/1\x01"
 
-    A change of their number while another thread of Python renders would deadlock, too: the context waits for its turn, and raises
-    `InputError` during another thread's run.
+
+@contextlib.contextmanager
+def two_threads(*files: str | Path) -> Iterator[None]:
+    """Give Dr.Jit at least two threads within this context if one of the files is an OpenEXR: with one, Mitsuba deadlocks on it.
+
+    A change of their number while another thread of Python renders would deadlock, too: the context waits for its turn.
+
+    Raises:
+        InputError: another thread's run goes on, or the threads are those of a parent process and do not exist in this fork of it.
     """
+    global _loading_process
     ensure()
     import drjit as dr
 
+    _loading_process = _loading_process or os.getpid()
+    if not any(map(_is_exr, map(Path, files))):
+        yield
+        return
     if dr.thread_count() > 1:
+        if _loading_process != os.getpid():
+            raise InputError(
+                "this process is a fork of one that has used Mitsuba, and OpenEXR files would wait for that process' threads for ever; "
+                "start it by multiprocessing.get_context('spawn')"
+            )
         yield
         return
     with exclusive("a picture or scene file, with one thread of Dr.Jit"):

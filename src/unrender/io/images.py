@@ -203,7 +203,7 @@ def write(picture: Any, path: Path, half: bool = False) -> None:
         if values.ndim != 3 or values.shape[2] not in (1, 3, 4):
             raise InputError(f"no picture has {picture.shape[-1]} channels; expected 1, 3 or 4")
         picture = mi.Bitmap(values)
-    with variant.two_threads():
+    with variant.two_threads(path):
         if half:
             picture = picture.convert(picture.pixel_format(), mi.Struct.Type.Float16, False)
         picture.write(str(path))
@@ -244,7 +244,7 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
     import mitsuba as mi
 
     try:
-        with variant.two_threads():
+        with variant.two_threads(path):
             bitmap = mi.Bitmap(str(path))
         return _of_bitmap(bitmap, linearise, alpha)
     except InputError:

@@ -62,7 +62,8 @@ class Parsed:
         for node, names in zip(self.state.nodes, self._unread, strict=True):
             for name in names:
                 node.props.mark_queried(name, False)
-        with variant.two_threads(), plugins.only(plugins.own_folder()), _printable_log():
+        files = [node.props[_FILE] for node in self.state.nodes if _is_text(node.props, _FILE)]
+        with variant.two_threads(*files), plugins.only(plugins.own_folder()), _printable_log():
             result = mi.parser.instantiate(self.config, self.state)
         return result[0] if isinstance(result, list) else result
 
