@@ -152,9 +152,10 @@ def test_cells_that_hardly_change_the_pictures_are_told():
 
 
 @pytest.mark.parametrize(("size", "count"), [(0.07, 0), (0.03, 1)])
-def test_elements_of_a_list_have_a_lower_limit_than_cells(size: float, count: int):
+@pytest.mark.parametrize("unseen", [12, 36])
+def test_elements_of_a_list_have_a_lower_limit_than_cells(size: float, count: int, unseen: int):
     """Few probes leave single elements uncertain, and cells are medians over neighbours."""
-    seen = np.where(np.arange(48) % 4, 1.0, size)
+    seen = np.where(np.arange(48) < unseen, size, 1.0)
     assert len(undetermined_cells({"list": seen})) == count
     assert undetermined_cells({"wall": np.repeat(seen, 8).reshape(8, 48, 1)})
 

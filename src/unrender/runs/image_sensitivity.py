@@ -34,8 +34,8 @@ _PROJECTIONS = 1 << 25
 COUNTED = 0.1
 """Curvature relative to the median above which a cell counts in means over cells."""
 _INSENSITIVE, _INSENSITIVE_ALONE = 0.1, 0.05
-"""Sensitivity relative to the median below which a cell hardly affects the images, such as by bounced light alone; that of an element of a
-list, which has more noise than the medians over neighbouring cells."""
+"""Sensitivity relative to that of seen cells below which a cell hardly affects the images, such as by bounced light alone; that of an
+element of a list, which has more noise than the medians over neighbouring cells."""
 
 _REACHED, _WINDOWS = 5, 6
 """Fewest cells with paths in the windows of `around`, and least ratio of a texture's side to that of a window."""
@@ -263,14 +263,17 @@ def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
 
 
 def insensitive(values: np.ndarray) -> np.ndarray:
-    """Return a mask (...) of the cells of a texture or grid whose smoothed `sensitivity` (..., channels) is below a tenth of the median of
-    the non-zero ones."""
+    """Return a mask (...) of the cells of a texture or grid whose smoothed `sensitivity` (..., channels) is below a tenth of that of the
+    cells which the images show, see `_typical`."""
     smoothed = around(values)
-    return (
-        smoothed <= _INSENSITIVE * np.median(smoothed[smoothed > 0])
-        if (smoothed > 0).any()
-        else np.ones(smoothed.shape, bool)
-    )
+    return smoothed <= _INSENSITIVE * _typical(smoothed)
+
+
+def _typical(sensitivity: np.ndarray) -> float:
+    """Return the sensitivity above which elements have half of the sum; most elements may be unseen, so it is not their median."""
+    ordered = np.sort(sensitivity, axis=None)
+    sums = np.cumsum(ordered, dtype=np.float64)
+    return float(ordered[np.searchsorted(sums, 0.5 * sums[-1])])
 
 
 def seen_cells(values: np.ndarray) -> np.ndarray | None:
@@ -279,13 +282,9 @@ def seen_cells(values: np.ndarray) -> np.ndarray | None:
 
 
 def seen_elements(values: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of the elements of a list, such as one of vertices, whose own sensitivity is at least a twentieth of the median of
-    the non-zero ones. Few probes leave it uncertain for single elements."""
-    return (
-        values > _INSENSITIVE_ALONE * np.median(values[values > 0.0])
-        if (values > 0.0).any()
-        else np.zeros(values.shape, bool)
-    )
+    """Return a mask (N,) of the elements of a list, such as one of vertices, whose own sensitivity is at least a twentieth of that of the
+    elements which the images show, see `_typical`. Few probes leave it uncertain for single elements."""
+    return values > _INSENSITIVE_ALONE * _typical(values)
 
 
 def adjoint_spp(problem: Problem) -> int:
