@@ -19,14 +19,14 @@ from unrender.methods.smoothed import SIGMA_HELP
 if TYPE_CHECKING:
     from unrender.estimators.base import Estimator
     from unrender.methods.plan import Plan
-    from unrender.methods.rules import exchangeable, paths, places, starts, traits
+    from unrender.methods.rules import exchangeable, paths, places, starts, traits, turns
     from unrender.optimizers.base import Optimizer
     from unrender.scene import render
     from unrender.scene.problem import Problem
 else:  # options are checked without Dr.Jit
     exchangeable, paths = lazy.modules("methods.rules.exchangeable", "methods.rules.paths")
     places, starts = lazy.modules("methods.rules.places", "methods.rules.starts")
-    traits = lazy.Module("methods.rules.traits")
+    traits, turns = lazy.modules("methods.rules.traits", "methods.rules.turns")
     render = lazy.Module("scene.render")
 
 
@@ -105,13 +105,13 @@ class AutoMethod(Options):
         known = traits.Traits(problem, self, CONSTANTS)
         plan = next(plan for rule in paths.RULES if (plan := rule(known)) is not None)
         plan = replace(plan, reasons=(*plan.reasons, *known.notes, *exchangeable.exchangeable(known)))
-        keys = list(known.infos)
-        if known.elements <= CONSTANTS.few_numbers:
-            by_paths = isinstance(plan.estimator, estimators.PathGradient | estimators.PathThenNewton)
-            varied = [k for k in places.varied_keys(problem, keys) if not (by_paths and places.is_scale(problem, k))]
-            plan = replace(plan, other_starts=tuple(varied))
-            if any(places.starts_at_bound(problem, key) for key in keys):
-                plan = starts.best_start(known, keys, plan)
+        keys, few = list(known.infos), known.elements <= CONSTANTS.few_numbers
+        by_paths = isinstance(plan.estimator, estimators.PathGradient | estimators.PathThenNewton)
+        varied = places.varied_keys(problem, keys) if few else []
+        varied = [key for key in varied if not (by_paths and places.is_scale(problem, key))]
+        plan = replace(plan, other_starts=tuple(dict.fromkeys([*varied, *turns.turned_keys(problem, keys)])))
+        if few and any(places.starts_at_bound(problem, key) for key in keys):
+            plan = starts.best_start(known, keys, plan)
         shorter = self._shorter(plan, 0.0)
         return replace(plan, cheaper=partial(self._cheaper, plan, measured())) if shorter else plan
 

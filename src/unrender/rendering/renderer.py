@@ -51,6 +51,7 @@ class ParameterInfo:
         scattering: what it changes the form of: a "bsdf", as a roughness does, not a colour, or a "medium"; else "".
         length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
         angle, axial: whether its values are angles in radians; whether they turn a light whose own axis no picture shows.
+        forward: direction in which the sensor, spotlight or projector that it turns looks as loaded, in world space; else None.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
         of_expression: whether expressions read it, which may be nonlinear.
         shown: whether images can depend on it, as depths cannot on a colour.
@@ -79,6 +80,7 @@ class ParameterInfo:
     scattering: Literal["", "bsdf", "medium"] = ""
     angle: bool = False
     axial: bool = False
+    forward: tuple[float, ...] | None = None
     lobe: bool = False
     of_expression: bool = False
     length: float = 1.0

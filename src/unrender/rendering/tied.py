@@ -82,6 +82,7 @@ class Tie:
             resizable=all(info.resizable for info in infos),
             light=all(info.light for info in infos),
             axial=False,  # lights of different directions determine a turn of all together
+            forward=None,
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
             of_expression=any(info.of_expression for info in infos),
             length=max(info.length for info in infos),

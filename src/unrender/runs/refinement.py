@@ -18,7 +18,8 @@ from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.estimators.hybrid import HybridGradient, HybridState, beyond_paths
-from unrender.methods.rules.places import has_scale
+from unrender.methods.rules.constants import CONSTANTS
+from unrender.methods.rules.places import has_scale, varied_keys
 from unrender.methods.rules.starts import Place, better_place, number_of_places
 from unrender.methods.rules.turns import better_turn, number_of_turns, turned_keys
 from unrender.optimizers.partitioned import Partitioned
@@ -215,6 +216,9 @@ compared; least number of paths of a picture."""
 BEGUN_AGAIN = "begins again after step"
 """First words of the line about other values."""
 _ERRORS = 4.0  # standard errors of the loss of scales, above which they are compared
+_STILL, _CLEARLY = 0.25, 0.9
+"""Share of the loss at initial values of all unknowns but poses that a descent must leave, and of the loss that a turn must have, if turns
+are compared at these values."""
 _NUMBER, _KEPT = 4, "kept"  # index of the set of random numbers; outcome of a comparison without a better place
 
 
@@ -227,31 +231,35 @@ class OtherStart(Callback):
     itself decides for positive numbers without an upper bound, such as an aperture, whose wrong pictures differ little: pictures with more
     paths compare it with 0, and with that of the best other values.
 
-    If a block of the unknowns (`Partitioned`) has rotations of shapes, other turns are compared instead, and any smaller loss is enough,
-    beyond noise. The block begins again there; the other unknowns go on.
+    Other turns of rotations without bounds are compared, too, and any smaller loss is enough, beyond noise; beside unknowns that are not
+    few, only turns are. The other unknowns go on, see `_turned`.
     """
 
     def before_step(self, run: Run) -> None:
         state, keys = run.state, run.plan.other_starts
         if not keys or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
             return
-        rotations = turned_keys(run.problem, keys) if isinstance(run.optimizer, Partitioned) else ()
-        places = number_of_turns(run.problem, rotations) if rotations else number_of_places(run.problem, keys)
+        rotations = turned_keys(run.problem, keys)
+        alone = _few(run.problem) and not (rotations and isinstance(run.estimator, HybridGradient))
+        varied = varied_keys(run.problem, keys) if alone else []
+        places = 2 * number_of_turns(run.problem, rotations) + number_of_places(run.problem, varied)
         share = _SHARE_OF_SCALES if has_scale(run.problem, keys) else _SHARE
         paths = max(share / places * state.samples, _LEAST_PATHS)
         pictures = FreshPictures(run.problem, run.seed, paths, _NUMBER)
         if run.problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
-        state.other_start = (_turned(run, pictures, rotations) if rotations else _moved(run, pictures)) or _KEPT
+        state.other_start = _moved(run, pictures, varied) or _turned(run, pictures, rotations) or _KEPT
 
     def on_result(self, run: Run, result: Result) -> Result:
         line = run.state.other_start
         return replace(result, adapted=[*result.adapted, line]) if line not in ("", _KEPT) else result
 
 
-def _moved(run: Run, pictures: FreshPictures) -> str:
+def _moved(run: Run, pictures: FreshPictures, keys: Sequence[str]) -> str:
     """Begin again at other values with a much better picture. Returns a line about them, or ""."""
-    problem, values, keys = run.problem, run.full(), run.plan.other_starts
+    problem, values = run.problem, run.full()
+    if not keys:
+        return ""
     scales, judged = has_scale(problem, keys), pictures
     if scales:
         judged = FreshPictures(problem, run.seed, max(_JUDGED * run.state.samples, pictures.paths), _NUMBER)
@@ -272,16 +280,34 @@ def _moved(run: Run, pictures: FreshPictures) -> str:
 
 
 def _turned(run: Run, pictures: FreshPictures, rotations: Sequence[str]) -> str:
-    """Let the block of poses begin again where shapes are turned, if that picture is better. Returns a line about it, or ""."""
-    problem = run.problem
-    if not (place := better_turn(problem, pictures, run.full(), rotations)):
+    """Let poses begin again at other turns, if these have a better picture. Returns a line about them, or "".
+
+    Textures and numbers that have adapted to a wrong turn hide the right one. So if no turn is better, and the loss is still a large share
+    of that at the initial values of these, turns are compared with their initial values, and a clearly better one begins there.
+    """
+    problem, values, known = run.problem, run.full(), run.problem.renderer.parameters()
+    place, others = better_turn(problem, pictures, values, rotations), {}
+    if place is None:
+        start = problem.start(run.step + run.ahead)
+        others = {key: x for key, x in start.items() if not known[key].rigid}
+        before = values | {key: x for key, x in problem.full(start).items() if key in others}
+        now, first = (mean_and_error(pictures.losses(pictures.images(x)))[0] for x in (values, before))
+        if others and now > _STILL * first:
+            place = better_turn(problem, pictures, before, rotations, _CLEARLY)
+    if place is None:
         return ""
-    run.parameters = {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}}
+    run.parameters = {**run.parameters, **others, **{k: problem.renderer.array(x) for k, x in place.values.items()}}
     arrays.evaluate(run.parameters)
-    _restart(run, rotations)
+    _restart(run, [*rotations, *others])
     run.state.numbers = NumberTrace()
-    return f"{BEGUN_AGAIN} {run.step} with other turns of {listed(list(place.values))}, {_loss(place)}"
+    beside = f" and initial values of {listed(list(others))}" if others else ""
+    than = "with the present turns" if others else "of the descent so far"
+    return f"{BEGUN_AGAIN} {run.step} with other turns of {listed(list(place.values))}{beside}, {_loss(place, than)}"
 
 
-def _loss(place: Place) -> str:
-    return f"where the loss is {place.share:.0%} of that of the descent so far"
+def _few(problem: Problem) -> bool:
+    return sum(unknown.initial.size for unknown in problem.unknowns.values()) <= CONSTANTS.few_numbers
+
+
+def _loss(place: Place, than: str = "of the descent so far") -> str:
+    return f"where the loss is {place.share:.0%} of that {than}"

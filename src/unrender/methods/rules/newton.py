@@ -25,7 +25,6 @@ from unrender.methods.base import measure
 from unrender.methods.plan import Plan
 from unrender.methods.rules.starts import best_start, stands_out
 from unrender.methods.rules.traits import Traits, choose_sampler, samples_per_pixel, within
-from unrender.methods.rules.turns import turned_keys
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.partitioned import Partitioned, Successive
@@ -149,7 +148,6 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
         estimator=HybridGradient(plan.estimator, estimator, keys, wait=wait, every=every, eliminated=eliminated),
         optimizer=Partitioned(keys, optimizer, plan.optimizer),
         reasons=(reason, *plan.reasons),
-        other_starts=turned_keys(problem, keys),
     )
     return best_start(traits, keys, made)
 

@@ -55,7 +55,7 @@ class PoseKey:
         axis: 0 to 2, or None for all.
         light: whether the target emits light.
         smooth: whether it changes the radiance of a light continuously, and no path, so that path replay gives its derivative.
-        axial: see `ParameterInfo`.
+        axial, forward: see `ParameterInfo`.
     """
 
     target: str
@@ -64,6 +64,7 @@ class PoseKey:
     light: bool = False
     smooth: bool = False
     axial: bool = False
+    forward: tuple[float, ...] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -85,16 +86,20 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     counts = Counter(target for target, _, _ in targets)
     turning = {lamp.id() for lamp in lamps if _turns_smoothly(lamp)}
     axial = {lamp.id() for lamp in lamps if _has_axis(lamp)}
+    looking = [lamp for lamp in lamps if "translation" in _LIGHTS.get(lamp.class_name(), ())]
+    looking += [sensor for sensor in scene.sensors() if sensor.get_shape() is None]
+    forward = {one.id(): _forward(one) for one in looking}
     result: dict[str, PoseKey] = {}
     for target, parts, light in targets:
         if _NAMELESS.fullmatch(target) or counts[target] > 1:
             continue
         for part in parts:
-            key, kinds = f"{target}.{part}", [part == "rotation" and target in of for of in (turning, axial)]
-            result[key] = PoseKey(target, part, None, light, *kinds)
+            key, turn = f"{target}.{part}", part == "rotation"
+            own = light, turn and target in turning, turn and target in axial, forward.get(target) if turn else None
+            result[key] = PoseKey(target, part, None, *own)
             if part != "scale":
                 for axis, name in enumerate(_AXES):
-                    result[f"{key}.{name}"] = PoseKey(target, part, axis, light, *kinds)
+                    result[f"{key}.{name}"] = PoseKey(target, part, axis, *own)
     return result
 
 
@@ -103,6 +108,15 @@ def _has_axis(lamp: Any) -> bool:
     if lamp.class_name() != "SpotLight":
         return lamp.class_name() == "DirectionalEmitter"
     return not {name for name, _ in mi.traverse(lamp) if name.startswith("texture.")} - {"texture.value"}
+
+
+def _forward(item: Any) -> tuple[float, ...] | None:
+    """Return the direction of the local z-axis of a sensor or light in world space; None for one without."""
+    known: Any = mi.traverse(item)
+    if "to_world" not in known:
+        return None
+    axis = np.array(dr.detach(known["to_world"].matrix), float).reshape(4, 4)[:3, 2]
+    return tuple(map(float, axis / max(float(np.linalg.norm(axis)), 1e-300)))
 
 
 def _turns_smoothly(lamp: Any) -> bool:
@@ -157,6 +171,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -
         sensor=sensor,
         angle=key.part == "rotation",
         axial=key.axial,
+        forward=key.forward,
         length=length if key.part == "translation" else 1.0,
     )
 
