@@ -10,8 +10,9 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.methods.rules.exchangeable import ambiguous_blends
 from unrender.rendering.renderer import ParameterInfo
-from unrender.runs.truth_check import further_from_truth
+from unrender.runs.truth_check import exchanged, further_from_truth
 
 SIDE, CELLS = 12, 8
 START = 0.2
@@ -174,3 +175,26 @@ def test_equal_lights_in_each_others_place_have_the_errors_of_the_nearer_places(
         )
     else:
         assert not any("place" in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("eta", "most", "unknown", "told"),
+    [(1.5, 1.0, 2, True), (1.6, 1.0, 2, False), (1.5, 0.4, 2, False), (1.5, 1.0, 1, False)],
+)
+def test_children_of_a_blend_in_each_others_place_are_named(eta: float, most: float, unknown: int, told: bool) -> None:
+    """A run ended at (0.71, 0.4, 0.1) ± 0.02 instead of (0.3, 0.1, 0.4), and did not say that the pictures are equal."""
+    keys = ["ball.bsdf.weight.value", *(f"ball.bsdf.bsdf_{child}.alpha.value" for child in (0, 1))]
+    truth = dict(zip(keys, map(np.array, (0.3, 0.1, 0.4)), strict=True))
+    fixed = {f"ball.bsdf.bsdf_{child}.eta.value": np.array(x) for child, x in ((0, 1.5), (1, eta))}
+    renderer = AnalyticRenderer({**truth, **fixed}, np.ones((SIDE * SIDE * 3, 5)), noise=0.02, shape=(SIDE, SIDE))
+    view = ur.View(renderer.exact({**truth, **fixed}))
+    known = [ur.Parameter(key, initial=0.3, bounds=(0.0, most)) for key in keys[: unknown + 1]]
+    problem = ur.Problem(renderer, known, [view], truth={key: truth[key] for key in keys[: unknown + 1]})
+    assert [line.partition(":")[0] for line in ambiguous_blends(problem)] == (
+        ["ball.bsdf.bsdf_0, ball.bsdf.bsdf_1"] if told else []
+    )
+    last = {key: np.array(x) for key, x in zip(keys, (0.71, 0.39, 0.11), strict=True) if key in problem.unknowns}
+    values, said = exchanged(problem, last)
+    expected = (0.29, 0.11, 0.39) if told else last.values()
+    assert [float(x) for x in values.values()] == pytest.approx([float(x) for x in expected])
+    assert len(said) == told

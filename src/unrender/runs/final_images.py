@@ -12,6 +12,7 @@ import numpy as np
 from unrender.core import phases, timing
 from unrender.core.text import names_in
 from unrender.io.resampling import resize_nearest
+from unrender.methods.rules.exchangeable import ambiguous_blends
 from unrender.runs.budget import LEAST_NUMBERS, MOST_SLOWDOWN, cost_of_end, seconds_of_steps, slowdown
 from unrender.runs.determination import (
     common_factor,
@@ -285,6 +286,7 @@ def _undetermined(
     lines += hidden_changes(problem, result.parameters, per_pass, within(2.0 * allowed), per_pass)
     limits = within(seconds), per_pass, within(most), tests.path_seconds
     lines += blurred_cells(problem, result.parameters, known, spp, *limits) if tests.left() > 0.0 else []
+    lines += ambiguous_blends(problem)
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in told]
         lines += numbers.missing([key for key in numbers.unchecked if key in told] + [*numbers.undetermined])

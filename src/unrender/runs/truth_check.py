@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.methods.rules.exchangeable import exchangeable_pairs
+from unrender.methods.rules.exchangeable import exchangeable_children, exchangeable_pairs
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, root_of_covariance, seen_cells
@@ -110,19 +110,21 @@ def further_from_truth(
 
 
 def exchanged(problem: Problem, values: Mapping[str, np.ndarray]) -> tuple[Mapping[str, np.ndarray], list[str]]:
-    """Return values with equal lights exchanged where that is nearer to the truth, and a line about each such pair.
+    """Return values with equal lights, or children of blends, exchanged where that is nearer to the truth, and a line about each such pair.
 
-    All values of such a light are unknown or equal to those of the other, so the pictures stay the same. Poses are relative to a light's
-    own place, so lights with these are left as they are.
+    All values of these are unknown or equal to those of the other, so the pictures stay the same. Poses are relative to a light's own
+    place, so lights with these are left as they are.
     """
     infos, lines = problem.renderer.parameters(), []
-    for pair in exchangeable_pairs(problem):
+    children = exchangeable_children(problem)
+    for pair in (*exchangeable_pairs(problem), *children):
         one, other = ([key for key in values if key.startswith(f"{name}.")] for name in pair)
         partners = dict(zip([*one, *other], [*other, *one], strict=True)) if len(one) == len(other) else {}
         equal = all(key.removeprefix(pair[0]) == partners[key].removeprefix(pair[1]) for key in one if partners)
         if not partners or not equal or any(infos[key].rigid or key not in problem.truth for key in partners):
             continue
-        swapped = {**values, **{key: values[partner] for key, partner in partners.items()}}
+        weights = {children[pair]: 1.0 - values[children[pair]]} if pair in children else {}
+        swapped = {**values, **{key: values[partner] for key, partner in partners.items()}, **weights}
         now, then = (problem.parameter_error(x) for x in (values, swapped))
         if math.prod(then[key] / now[key] for key in partners if now[key] > 0.0) < _EXCHANGED ** len(partners):
             values, errors = swapped, [f"{key} {problem.unknowns[key].measure.text(then[key])}" for key in partners]

@@ -1,4 +1,4 @@
-"""Lights and shapes that equal each other but for unknown places, so that a run may end with each in the other's place."""
+"""Lights, shapes and children of blends that equal each other but for unknowns, so that a run may end with each in the other's place."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from unrender.scene.problem import Problem
 
 _MOTIONS = ("translation", "rotation", "scale")
 """Parts of the keys of poses, after the name of what they move."""
+_WEIGHT, _CHILDREN = ".weight.", ("bsdf", "phase")
+"""What is in the keys of a blend's weight, and beginnings of the names of its children."""
 _POSITION = "position"  # last part of the keys of positions of lights without a pose
 _NORMALS, _TRANSFORM, _ROUNDING = "_normals", "to_", 1e-4
 """Last part of the keys of normals, and its beginning for transforms, which are not compared; largest difference of equal positions,
@@ -46,6 +48,39 @@ def exchangeable_pairs(problem: Problem, shapes: bool = False) -> list[tuple[str
     return [pair for pair in combinations(moved, 2) if _alike(problem, *pair, moved)]
 
 
+def exchangeable_children(problem: Problem) -> dict[tuple[str, str], str]:
+    """Return {names of the children: key of the weight w} of blends whose children equal each other but for unknowns of both.
+
+    Exchanged, with 1 − w in place of w, they give the same picture, unless bounds keep w on one side of a half.
+    """
+    infos, unknown, found = problem.renderer.parameters(), problem.shapes(), {}
+    for key in (key for key in unknown if _WEIGHT in key):
+        low, high = ends_of(problem.unknowns[key].bounds)
+        for child in _CHILDREN:
+            one, other = (f"{key.partition(_WEIGHT)[0]}.{child}_{index}" for index in (0, 1))
+            parts, others = ({k.removeprefix(x) for k in infos if k.startswith(f"{x}.")} for x in (one, other))
+            pairs = [(one + part, other + part) for part in parts]
+            both = {(k in unknown) + (twin in unknown) for k, twin in pairs}
+            if (
+                parts == others
+                and 2 in both
+                and 1 not in both
+                and low < 0.5 < high
+                and _interchangeable(problem, pairs)
+            ):
+                found[one, other] = key
+    return found
+
+
+def ambiguous_blends(problem: Problem) -> list[str]:
+    """Return a line for each blend whose children may be exchanged, see `exchangeable_children`."""
+    return [
+        f"{listed(pair)}: the pictures are the same with each in the other's place, and 1 - x in place of {weight}; the start decides, so "
+        "fix one of these, or narrow the weight's bounds to one side of a half"
+        for pair, weight in exchangeable_children(problem).items()
+    ]
+
+
 def _names(pairs: Sequence[tuple[str, str]]) -> list[str]:
     return list(dict.fromkeys(name for pair in pairs for name in pair))
 
@@ -73,13 +108,19 @@ def _alike(problem: Problem, one: str, other: str, moved: Mapping[str, set[str]]
         part for part in parts[0] if (infos[one + part].brightness == "light" or shape) and not infos[one + part].rigid
     ]
     pairs = [(one + part, other + part) for part in counted if not part.endswith(_NORMALS)]
+    return _interchangeable(problem, pairs, [(one + part, other + part) for part in moved[one]])
+
+
+def _interchangeable(problem: Problem, pairs: Sequence[tuple[str, str]], moved: Sequence[tuple[str, str]] = ()) -> bool:
+    """Return whether parameters are unknown or equal to their partners, and bounds of unknown ones, `moved` too, have a common value."""
+    infos = problem.renderer.parameters()
     fixed = [pair for pair in pairs if not any(key in problem.shapes() for key in pair)]
     values = problem.renderer.values([key for pair in fixed for key in pair])
     if not all(_equal(np.asarray(values[key]), np.asarray(values[twin]), infos[key].welded) for key, twin in fixed):
         return False
     known = {key: ends_of(unknown.bounds) for key, unknown in problem.unknowns.items() if not infos[key].rigid}
-    both = [(known[one + x], known[other + x]) for x in (*counted, *moved[one]) if {one + x, other + x} <= known.keys()]
-    return all(max(a[0], b[0]) <= min(a[1], b[1]) for a, b in both)  # bounds with a common value
+    both = [(known[key], known[twin]) for key, twin in (*pairs, *moved) if {key, twin} <= known.keys()]
+    return all(max(a[0], b[0]) <= min(a[1], b[1]) for a, b in both)
 
 
 def _equal(one: np.ndarray, other: np.ndarray, vertices: bool) -> bool:
