@@ -513,3 +513,18 @@ def test_values_that_python_neither_prints_converts_nor_compares_are_one_line(wr
         }
         for name in known.keys() - set(tables):
             attempt(made_by, **{**needed, name: wrong})
+
+
+def test_methods_refuse_other_views_images_and_keys() -> None:
+    """An image (H, W, 1) would broadcast to a value that looks right."""
+    made = problem(truth={"wall.value": [0.1, 0.2, 0.3]})
+    for method in (made.reference, made.mask, made.test_weights):
+        with pytest.raises(InputError, match=r"view must be at most 0, got 1"):
+            method(1)
+    for method in (made.loss_value, made.loss_derivative, made.loss_values):
+        with pytest.raises(InputError, match=r"shape of the reference, \(4, 5, 3\), got \(4, 5, 1\)"):
+            method(0, REFERENCE[..., :1])
+    wrong: Any
+    for wrong in ({"wal.value": 0.5}, None):
+        with pytest.raises(InputError, match=r"parameter_error: expected values of \['wall.value'\], got "):
+            made.parameter_error(wrong)

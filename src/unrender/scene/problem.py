@@ -319,8 +319,15 @@ class Problem(ViewLosses):
         return {key: self.unknowns[key].full(arrays.numpy(value)) for key, value in parameters.items()}
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Return the error of each parameter whose truth is known, see `Unknown.error`. Waits for the device."""
+        """Return the error of each parameter whose truth is known, see `Unknown.error`. Waits for the device.
+
+        Raises:
+            InputError: a parameter whose truth is known has no value.
+        """
         known = [key for key, u in self.unknowns.items() if u.truth is not None or u.surface is not None]
+        if not isinstance(parameters, Mapping) or not parameters.keys() >= {*known}:
+            given = sorted(map(str, parameters)) if isinstance(parameters, Mapping) else in_words(parameters)
+            raise InputError(f"parameter_error: expected values of {known}, got {given}")
         full = self.full({key: parameters[key] for key in known})
         errors = {key: self.unknowns[key].error(values) for key, values in full.items()}
         return {key: error for key, error in errors.items() if error is not None}

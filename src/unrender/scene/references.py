@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.io.stored_pictures import StoredPicture
@@ -241,6 +241,9 @@ class ViewLosses:
         warnings.warn("Problem.given_views is now Problem.original_views", DeprecationWarning, stacklevel=2)
         return self.original_views
 
+    def _view(self, view: int) -> View:
+        return self.views[checks.integer("Problem", "view", view, 0, len(self.views) - 1)]
+
     @property
     def sizes(self) -> list[tuple[int, int]]:
         """(height, width) of each view."""
@@ -251,7 +254,7 @@ class ViewLosses:
         """Return the view's reference as an array of the renderer, (H, W, 3)."""
         if view in self._references:
             return self._references[view]
-        array = self.renderer.array(np.asarray(self.views[view].reference))
+        array = self.renderer.array(np.asarray(self._view(view).reference))
         if not self.references.in_host_memory:
             self._references[view] = array
         return array
@@ -260,7 +263,7 @@ class ViewLosses:
         """Return the view's mask as an array of the renderer, (H, W, 1), or None if every pixel counts."""
         if view in self._masks:
             return self._masks[view]
-        mask = self.views[view].mask
+        mask = self._view(view).mask
         array = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
         if not self.references.in_host_memory:
             self._masks[view] = array
@@ -291,7 +294,7 @@ class ViewLosses:
         Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there. Residuals of AOVs
         beside other views are multiplied by `units`, so that their references count as those of colour.
         """
-        weights = self.views[view].pixel_weights(self.sizes[view])
+        weights = self._view(view).pixel_weights(self.sizes[view])
         if not isinstance(self.loss, Censored):
             return weights
         return weights * determined_pixels(
@@ -320,5 +323,11 @@ class ViewLosses:
         return values if mask is None or not self.loss.pixelwise else values * mask
 
     def _masked(self, image: Array, reference: Array, mask: Array | None) -> Array:
-        """Return the argument of the loss: the image for a pixelwise loss, else the reference and image blended by the mask."""
+        """Return the argument of the loss: the image for a pixelwise loss, else the reference and image blended by the mask. Raises
+        `InputError` for another shape, which NumPy might broadcast."""
+        shape = tuple(getattr(image, "shape", ()))
+        if shape[-3:] != arrays.shape(reference)[-3:]:
+            raise InputError(
+                f"Problem: image must have the shape of the reference, {arrays.shape(reference)[-3:]}, got {shape}"
+            )
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
