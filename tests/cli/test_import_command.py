@@ -350,7 +350,7 @@ def _top(name: str, value: Any) -> Callable[[Path], None]:
 
 
 BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no photograph": (lambda c: shutil.rmtree(c / "images"), "head: all of its photographs are missing"),
+    "no photograph": (lambda c: shutil.rmtree(c / "images"), "photographs are missing, the first images/view_"),
     "other proportions": (_shrink, "view_2.png: 40 x 30 pixels, but its camera has 40 x 40"),
     "a cut photograph": (lambda c: _cut(_photograph(c)), "view_2.png: cannot be read as a picture"),
     "an empty photograph": (lambda c: _photograph(c).write_bytes(b""), "view_2.png: cannot be read as a picture"),
@@ -472,6 +472,10 @@ def _missing(capture: Path) -> None:
     _photograph(capture, 3).unlink()
 
 
+def _twice(capture: Path) -> None:
+    edit(capture, lambda document: document["frames"].append(document["frames"][2]))
+
+
 def _without_pose(capture: Path) -> None:
     shutil.copy(_photograph(capture), capture / "images" / "another.png")
 
@@ -484,6 +488,7 @@ UNUSUAL: dict[str, tuple[Callable[[Path], Any], str]] = {
     "mixed sizes": (_larger, ""),
     "alpha": (_as_alpha, ""),
     "a missing photograph": (_missing, "1 of 9 photographs are missing and were skipped, the first images/view_3.png"),
+    "a photograph twice": (_twice, "1 of 10 photographs are listed again and were skipped"),
     "a picture without a pose": (_without_pose, "1 pictures have no pose and were skipped, the first another.png"),
     "a world of a million": (matrices(lambda m: np.c_[m[:, :3], m[:, 3] * [1e6, 1e6, 1e6, 1]]), ""),
     "a scale in the matrices": (matrices(lambda m: m @ np.diag([3.0, 3.0, 3.0, 1.0])), ""),

@@ -319,17 +319,12 @@ class Problem(ViewLosses):
         return {key: self.unknowns[key].full(arrays.numpy(value)) for key, value in parameters.items()}
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Return the error of each parameter whose truth is known, see `Unknown.error`. Waits for the device.
-
-        Raises:
-            InputError: a parameter whose truth is known has no value.
-        """
+        """Return the error of each parameter whose truth is known, see `Unknown.error`. Raises `InputError` for missing ones."""
         known = [key for key, u in self.unknowns.items() if u.truth is not None or u.surface is not None]
         if not isinstance(parameters, Mapping) or not parameters.keys() >= {*known}:
-            given = sorted(map(str, parameters)) if isinstance(parameters, Mapping) else in_words(parameters)
-            raise InputError(f"parameter_error: expected values of {known}, got {given}")
-        full = self.full({key: parameters[key] for key in known})
-        errors = {key: self.unknowns[key].error(values) for key, values in full.items()}
+            raise InputError(f"parameter_error: expected values of {known}, got {in_words(parameters)}")
+        values = self.full({key: parameters[key] for key in known})
+        errors = {key: self.unknowns[key].error(values[key]) for key in known}
         return {key: error for key, error in errors.items() if error is not None}
 
 
@@ -342,18 +337,16 @@ def _opened(
 ) -> tuple[Renderer, tuple[View, ...]]:
     """Return the renderer of a scene, with unknowns that photographs have, and the views by its sensors. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
-    renderer = open_scene(scene, max_depth, parameters, known_keys(views), expressions)
+    known = known_keys(views)
+    renderer = open_scene(scene, max_depth, parameters, known, expressions)
     members = list(dict.fromkeys([*scene_keys(parameters), *(expressions or ())]))
-    renderer, located = of_views(
-        renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
-    )
-    sensors = [view.sensor for view in located]
+    renderer, located = of_views(renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known]))
     for index, view in enumerate(views):
         if view.aov is not None and (conflict := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
             what = f"not supported together with the unknown {conflict}; leave out one of them"
             raise FieldError(("views", index, "aov"), what)
     try:
-        return with_photographs(renderer, keys, sensors), located
+        return with_photographs(renderer, keys, [view.sensor for view in located]), located
     except InputError as error:
         named = str(error).partition(":")[0]
         raise FieldError(("parameters", keys.index(named), "key"), str(error)) from error

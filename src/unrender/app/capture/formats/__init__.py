@@ -26,7 +26,7 @@ or none has. White (above 0.5) is inside.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -83,14 +83,25 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
         if kind in (None, name) and each.recognise(folder):
             capture = each.read(folder, masks)
             if not capture.photographs:
-                raise InputError(f"{folder}: all of its photographs are missing")
+                first = "".join(capture.notices).partition(", the first")
+                raise InputError(f"{folder}: all of its photographs are missing{''.join(first[1:])}")
             _check(capture, masks)
-            return capture
+            return _each_once(capture)
     if kind is not None:
         raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
     raise InputError(
         f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}"
     )
+
+
+def _each_once(capture: Capture) -> Capture:
+    """Return the capture with each file once, and held out if it is so anywhere: evaluation must not see what the run has."""
+    unique = {each.file.resolve(): each for each in sorted(capture.photographs, key=lambda each: bool(each.held_out))}
+    if not (twice := len(capture.photographs) - len(unique)):
+        return capture
+    notice = f"{twice} of {len(capture.photographs)} photographs are listed again and were skipped"
+    photographs = tuple(each for each in capture.photographs if any(each is one for one in unique.values()))
+    return replace(capture, photographs=photographs, notices=(*capture.notices, notice))
 
 
 def _check(capture: Capture, masks: Path | None) -> None:
