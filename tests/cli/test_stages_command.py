@@ -351,6 +351,26 @@ def test_budgets_are_split_by_shares() -> None:
         assert [seconds for _, seconds in found] == [2.0, 2.0, 10.0]
 
 
+def test_a_stage_loses_the_time_that_was_spent_before_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With each of its seconds for itself, a run of 6 s took 9: loading and the end of each stage were extra."""
+    clock, began = [100.0], []
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(stages, "reader", SimpleNamespace(read=lambda _: SimpleNamespace(parameters={})))
+    monkeypatch.setattr("unrender.app.cli.run.conclude", lambda *_, **more: None)
+
+    def run_stage(run: Any, index: int, values: Any, console: Any, progress: Any) -> tuple[None, None]:
+        began.append(progress.budget_began)
+        clock[0] = began[-1] + (2.0, 12.0, 1.0)[index]
+        return None, None
+
+    monkeypatch.setattr(stages, "_run_stage", run_stage)
+    made = tuple(stages_file.Stage(f"s{index}", ("a",), share) for index, share in enumerate((2.0, 5.0, 1.0)))
+    several = stages_file.Stages(Path("p"), made, seconds=16.0, run=stages_file.RunOptions())
+    run: Any = SimpleNamespace(stages=several, out=tmp_path, options=several.run)
+    stages._run_stages(run, Console(file=io.StringIO()), SimpleNamespace(budget_began=97.0))  # pyright: ignore
+    assert began == [97.0, 99.0, 109.0]
+
+
 def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     stage = stages_file.Stage("one", ("a", "b.c"), 2.0, 4, "rcv", {"spp": 4, "space": "path"})
     made = stages_file.Stages(
@@ -374,7 +394,7 @@ def test_a_doubtful_stage_before_a_resume_is_doubtful_at_its_end(
     monkeypatch.setattr(reader, "read", lambda folder: SimpleNamespace(parameters={}))
     run: Any = stages.StagesRun(planned, None, tmp_path, "", "", None)  # type: ignore[arg-type]
     with pytest.raises(typer.Exit) as left:
-        stages._run_stages(run, Console(file=io.StringIO()), None)  # type: ignore[arg-type]
+        stages._run_stages(run, Console(file=io.StringIO()), SimpleNamespace(budget_began=0.0))  # type: ignore[arg-type]
     assert left.value.exit_code == DOUBTFUL
 
 

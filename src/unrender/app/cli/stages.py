@@ -183,6 +183,7 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
 
     values: dict[str, np.ndarray] = {}
     doubtful = False
+    due = progress.budget_began  # a stage loses the time that loading and earlier stages have taken from it
     for index, stage in enumerate(run.stages.stages):
         folder = stages_file.folder_of(run.stages, index, run.out)
         console.print(f"[bold]stage {index + 1} of {len(run.stages.stages)}[/]: {escape(stage.name)}", soft_wrap=True)
@@ -190,6 +191,11 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
             console.say(f"{status}: {folder}")
             doubtful |= status in schema.DOUBTFUL
         else:
+            seconds = None if (folder / schema.RECORD).is_file() else stages_file.split(run.stages)[index][1]
+            progress.budget_began = now = time.perf_counter()
+            if seconds is not None:
+                progress.budget_began = min(due, now)
+            due = progress.budget_began + (seconds or 0.0)
             problem, result = _run_stage(run, index, values, console, progress)
             last = index == len(run.stages.stages) - 1
             page = last or run.options.final_spp is not None
@@ -215,7 +221,6 @@ def _run_stage(
 
     stages, stage = run.stages, run.stages.stages[index]
     folder = stages_file.folder_of(stages, index, run.out)
-    progress.budget_began = time.perf_counter()
     if (folder / schema.RECORD).is_file():
         stored = load_run(folder, *stages_file.split(stages)[index])
         problem = runs.problem_of(folder)
