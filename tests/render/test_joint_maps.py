@@ -1,4 +1,4 @@
-"""Textures of one surface whose changes hide one another in the pictures are named, and determined ones are not."""
+"""Textures and values at vertices of one surface whose changes hide one another are named, and determined ones are not."""
 
 from __future__ import annotations
 
@@ -152,6 +152,42 @@ def test_a_texture_of_small_changes_is_not_named():
     (line,) = hidden_changes(made, made.initial_values(), 16, math.inf)
     assert line.startswith(f"{BOARD[2]}: small changes of the surface's other textures hide its changes")
     assert BOARD[0] not in line
+
+
+def sheet(path: Path, attributes: tuple[str, ...], prior: Any = None) -> ur.Problem:
+    """A wall of metal as a mesh, before one lamp, with a colour and a roughness, some of which are at its vertices."""
+    starts = {"base_color": [0.5] * 3, "roughness": [0.5]}
+    y, x = np.mgrid[: TEXELS + 1, : TEXELS + 1] / TEXELS
+    corners = (np.arange(TEXELS)[:, None] * (TEXELS + 1) + np.arange(TEXELS)).reshape(-1, 1)
+    faces = np.concatenate([corners + [0, 1, TEXELS + 2], corners + [0, TEXELS + 2, TEXELS + 1]])
+    mesh: Any = mi.Mesh("wall", x.size, len(faces), has_vertex_texcoords=True)
+    values: Any = mi.traverse(mesh)
+    values["vertex_positions"] = mi.Float(np.float32(np.stack([2 * x - 1, 2 * y - 1, 0 * x], axis=-1).ravel()))
+    values["vertex_texcoords"] = mi.Float(np.float32(np.stack([x, y], axis=-1).ravel()))
+    values["faces"] = mi.UInt32(np.uint32(faces.ravel()))
+    values.update()
+    bsdf: dict[str, Any] = {"type": "principled", "metallic": 1.0}
+    for name, value in starts.items():
+        texels = mi.Bitmap(np.tile(np.array(value, np.float32), (TEXELS, TEXELS, 1)))
+        bsdf[name] = {"type": "bitmap", "bitmap": texels, "raw": True}
+        if name in attributes:
+            mesh.add_attribute(f"vertex_{name}", len(value), np.tile(np.array(value, np.float32), x.size))
+            bsdf[name] = {"type": "mesh_attribute", "name": f"vertex_{name}"}
+    mesh.write_ply(str(path / "wall.ply"))
+    wall = {"type": "ply", "filename": str(path / "wall.ply"), "bsdf": bsdf}
+    keys = [f"wall.vertex_{name}" if name in attributes else f"wall.bsdf.{name}.data" for name in starts]
+    unknowns = [ur.Parameter(key, prior=prior) for key in keys]
+    view = ur.View(np.full((SIZE, SIZE, 3), 0.3, np.float32))
+    return ur.Problem({**scene(*WHITE[:1]), "wall": wall}, unknowns, [view], max_depth=2)
+
+
+@pytest.mark.parametrize("attributes", [("base_color", "roughness"), ("roughness",)])
+def test_values_at_vertices_that_hide_others_are_told(attributes: Any, tmp_path: Path):
+    """Values at vertices of a mesh that hide others, or a texture, were another solution in silence."""
+    found = sheet(tmp_path, attributes)
+    (line,) = hidden_changes(found, found.initial_values(), 16, math.inf)
+    assert line.startswith(f"{', '.join(sorted(found.unknowns))}: changes of one hide those of another")
+    assert not untested_changes(sheet(tmp_path, attributes, prior={"total_variation": 0.1}))
 
 
 @pytest.mark.parametrize(("priors", "told"), [(0, True), (1, True), (2, False)])

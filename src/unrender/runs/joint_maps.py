@@ -1,4 +1,4 @@
-"""Detection of changes of textures that the images hide: those of one surface by one another, and details that blur together."""
+"""Detection of changes of textures, and of values at vertices, that the images hide: one by another, or details that blur together."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 
 import numpy as np
@@ -29,6 +30,7 @@ from unrender.runs.numbers import TOO_SHORT
 from unrender.scene.bounds import off_ends, project
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
+from unrender.scene.validation import texture_coordinates
 
 _SLOT = re.compile(r"\.(?:(?:nested_)?b(?:sdf|rdf)(?:_\d+)?|emitter)\.")
 """Name of a material within a shape or another material, or of a shape's emitter."""
@@ -173,11 +175,13 @@ def shares_surface(problem: Problem, key: str) -> bool:
 
 
 def _surfaces(problem: Problem) -> Iterator[list[str]]:
-    """Yield the keys of the textures of each surface whose changes may hide one another; none for many views."""
+    """Yield the keys of the textures, and values at vertices, of each surface whose changes may hide one another; none for many views."""
     known = problem.renderer.parameters()
     if len(selected_views(problem)) < len(problem.views):
         return
-    maps = [key for key in problem.unknowns if len(known[key].shape) == MAP_AXES and known[key].differentiable]
+    on_mesh = [key for key in problem.unknowns if known[key].mesh is not None and not known[key].welded]
+    maps = [key for key in problem.unknowns if len(known[key].shape) == MAP_AXES or key in on_mesh]
+    maps = [key for key in maps if known[key].differentiable]
     for _, of in groupby(sorted(maps, key=_surface_of), key=_surface_of):
         keys = sorted(of)
         free = any(problem.unknowns[key].prior is None for key in keys)  # otherwise priors decide
@@ -187,8 +191,8 @@ def _surfaces(problem: Problem) -> Iterator[list[str]]:
 
 @dataclass(frozen=True)
 class _Surface:
-    """Textures of one surface, whose texels share the cells of the coarsest one; for the attributes, see `hidden_changes`. `factor`
-    multiplies the number of adjoints."""
+    """Textures of one surface, whose texels share the cells of the coarsest one, or the vertices of a mesh with values at these; for the
+    attributes, see `hidden_changes`. `factor` multiplies the number of adjoints."""
 
     problem: Problem
     values: Mapping[str, np.ndarray]
@@ -204,19 +208,18 @@ class _Surface:
         matrix = self._matrix(fields, seconds)
         if matrix is None:
             return [_untested(self.keys)]
-        height, width = matrix.shape[:2]
-        smooth = neighbour_means(matrix.reshape(height, width, -1), channels=True).reshape(matrix.shape)
+        smooth = self._cells.neighbour_means(matrix)
         if not np.isfinite(smooth).all():
             return []
         amounts = _aligned(np.linalg.eigh(smooth)[1][..., 0])
         amounts /= np.abs(amounts).max(axis=-1, keepdims=True)
-        diagonal = np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1).sum(axis=(0, 1)), 0.0)
+        diagonal = np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1).sum(axis=0), 0.0)
         # Eigenvectors have no sign: one direction remains where values are at their bounds.
         after, parts = max(
             (self._within(fields, sign * amounts, diagonal) for sign in (1.0, -1.0)), key=lambda of: sum(of[1].values())
         )
         total = sum(parts.values())
-        joint = float(np.einsum("hwi,hwij,hwj->", amounts, matrix, amounts))
+        joint = float(np.einsum("ci,cij,cj->", amounts, matrix, amounts))
         named = [key for key, part in parts.items() if part > _NAMED**2 * max(parts.values())]
         sizes = self._sizes(fields, amounts, matrix)
         weak = [key for key in named if sizes[key] > _LARGE * max(sizes[k] for k in named)]
@@ -254,12 +257,14 @@ class _Surface:
         after, parts = {}, {}
         for key in self.keys:
             own = [n for n, (name, _) in enumerate(fields) if name == key]
-            before, squares, axes = np.asarray(self.values[key], np.float64), np.square(amounts[..., own]), (0, 1)
-            step = sum(_spread(amounts[..., n], before.shape)[..., None] * fields[n][1] for n in own)
-            after[key] = np.asarray(self.problem.unknowns[key].project(before + step), np.float32)
-            if self._is_normal(key):  # turns have no channels of their own, so both have the mean size
-                axes = (0, 1, 2)
-            left, whole = (np.square(x).sum(axis=axes) for x in (after[key] - before, step))
+            before, squares = np.asarray(self.values[key], np.float64), np.square(amounts[:, own])
+            axes = (
+                (0, 1) if self._is_normal(key) else 0
+            )  # turns have no channels of their own, so both have the mean size
+            step = sum(amounts[self._cells.of[key], n, None] * fields[n][1] for n in own)
+            moved = self.problem.unknowns[key].project(before + np.reshape(step, before.shape))
+            after[key] = np.asarray(moved, np.float32)
+            left, whole = (np.square(x).sum(axis=axes) for x in (self._rows(key, after[key] - before), step))
             parts[key] = float(np.sum(squares.mean(axis=axes) * diagonal[own] * left / np.maximum(whole, 1e-300)))
         return after, parts
 
@@ -268,7 +273,7 @@ class _Surface:
     ) -> dict[str, float]:
         """Return the root mean square of each texture's amounts, which are relative to its range, over the cells that the images show."""
         seen = np.maximum(np.trace(matrix, axis1=-2, axis2=-1), 0.0)
-        squares = np.einsum("hw,hwf->f", seen / max(float(seen.sum()), 1e-300), np.square(amounts))
+        squares = np.einsum("c,cf->f", seen / max(float(seen.sum()), 1e-300), np.square(amounts))
         return {
             k: math.sqrt(np.mean([x for x, (key, _) in zip(squares, fields, strict=True) if key == k]))
             for k in self.keys
@@ -277,11 +282,20 @@ class _Surface:
     def _is_normal(self, key: str) -> bool:
         return self.problem.renderer.parameters()[key].role == "normal"
 
+    @cached_property
+    def _cells(self) -> _Cells:
+        return _Cells.shared(self.problem, self.keys)
+
+    def _rows(self, key: str, values: np.ndarray) -> np.ndarray:
+        """Return values with an axis of texels or vertices and one of channels, (N, C)."""
+        return np.reshape(values, (len(self._cells.of[key]), -1))
+
     def _fields(self, key: str) -> Iterator[np.ndarray]:
-        """Yield the change of each channel of a texture, or turns of its normals along two tangents."""
-        values = np.asarray(self.values[key], np.float32)
+        """Yield the change (N, C) of each channel of a texture, or turns of its normals along two tangents."""
+        own = np.asarray(self.values[key], np.float32)
+        values = self._rows(key, own)
         if not self._is_normal(key):
-            step = _STEP * (changed(self.problem, key, values, np.ones(values.shape)) - values)
+            step = _STEP * (self._rows(key, changed(self.problem, key, own, np.ones(own.shape))) - values)
             yield from (step * (np.arange(step.shape[-1]) == channel) for channel in range(step.shape[-1]))
             return
         normals = 2.0 * values - 1.0
@@ -291,7 +305,7 @@ class _Surface:
         yield from (_TURN * first, _TURN * np.cross(normals, first))
 
     def _matrix(self, fields: Sequence[tuple[str, np.ndarray]], seconds: float) -> np.ndarray | None:
-        """Return the matrix of each cell, (h, w, F, F); None if there is not enough time."""
+        """Return the matrix of each cell, (cells, F, F); None if there is not enough time."""
         problem, values, key = self.problem, self.values, Key(0, _STREAM)
         views, started = range(len(problem.views)), timing.now()
 
@@ -301,7 +315,8 @@ class _Surface:
         before = pictures(values)
         if ((1 + ADJOINT * _LAUNCHES) * len(fields) + 4 * _RENDERINGS) * (timing.now() - started) > seconds:
             return None
-        moved = [pictures({**values, name: np.asarray(values[name] + x, np.float32)}) for name, x in fields]
+        steps = [np.asarray(x.reshape(np.shape(values[name])), np.float32) for name, x in fields]
+        moved = [pictures({**values, name: values[name] + x}) for (name, _), x in zip(fields, steps, strict=True)]
         changes = [
             np.nan_to_num(
                 np.stack([of[view] - before[view] for of in moved]) * np.float32(mask_roots(problem, view) ** 2)
@@ -312,36 +327,72 @@ class _Surface:
         if session is None:
             raise InputError("the textures have no derivatives together with other unknowns")
         tree, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
-        shape = tuple(min(np.shape(values[name])[axis] for name in self.keys) for axis in (0, 1))
-        matrix = np.zeros((len(fields), *shape, len(fields)))
+        count = math.prod(self._cells.shape)
+        matrix = np.zeros((len(fields), count, len(fields)))
         launches = self.factor * _LAUNCHES
         for launch in range(1, 1 + launches):
             seeds = {view: key.fold(launch).fold(view) for view in views}
             of = adjoints(problem, session, tree, keys, spp, seeds, changes)
-            matrix += np.stack([_pooled((of[name] * x).sum(axis=-1), shape) for name, x in fields], axis=-1) / launches
+            for n, (name, x) in enumerate(fields):
+                for row, gradient in zip(matrix, of[name], strict=True):
+                    weights = (self._rows(name, gradient) * x).sum(axis=-1) / launches
+                    row[:, n] += np.bincount(self._cells.of[name], weights, count)
         matrix = np.moveaxis(matrix, 0, -2)
         return 0.5 * (matrix + matrix.swapaxes(-1, -2))
 
 
-def _cells(size: int, count: int) -> np.ndarray:
-    return np.arange(size) * count // size
+@dataclass(frozen=True)
+class _Cells:
+    """Cells of a surface: texels (h, w) of the coarsest texture, or the vertices of a mesh.
 
+    Attributes:
+        of: {key: index of the cell of each texel or vertex, (N,)}.
+        shape: (h, w), or (vertices,).
+        faces: vertices of each face of a mesh, (F, 3).
+    """
 
-def _pooled(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the sums (K, h, w) over the texels of each cell of values (K, H, W)."""
-    rows, columns = (_cells(size, count) for size, count in zip(values.shape[1:], shape, strict=True))
-    of_rows = np.stack([values[:, rows == row].sum(axis=1) for row in range(shape[0])], axis=1)
-    return np.stack([of_rows[..., columns == column].sum(axis=-1) for column in range(shape[1])], axis=-1)
+    of: Mapping[str, np.ndarray]
+    shape: tuple[int, ...]
+    faces: np.ndarray | None = None
 
+    @classmethod
+    def shared(cls, problem: Problem, keys: Sequence[str]) -> _Cells:
+        """Return those of some keys of a surface. Texels of a mesh belong to the vertex with the nearest texture coordinates."""
+        known, shapes = problem.renderer.parameters(), problem.shapes()
+        on_mesh, mesh = next(((key, of) for key in keys if (of := known[key].mesh) is not None), ("", None))
+        textures = {key: shapes[key][:2] for key in keys if len(shapes[key]) == MAP_AXES}
+        if mesh is None:
+            height, width = (min(of) for of in zip(*textures.values(), strict=True))
+            grids = {key: np.indices(size).reshape(2, -1) * [[height], [width]] for key, size in textures.items()}
+            of = {k: x[0] // textures[k][0] * width + x[1] // textures[k][1] for k, x in grids.items()}
+            return cls(of, (height, width))
+        vertices, faces = mesh()
+        of = {key: np.arange(len(vertices)) for key in keys if key not in textures}
+        if textures:
+            uv = texture_coordinates(problem.renderer, on_mesh, 3 * len(vertices))
+            if uv is None:
+                raise InputError("a mesh without texture coordinates")
+            from scipy.spatial import KDTree  # takes long to import
 
-def _spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the values (h, w) of cells at the texels (H, W) of a texture."""
-    rows, columns = (_cells(size, count) for size, count in zip(shape[:2], values.shape, strict=True))
-    return values[rows[:, None], columns]
+            nearest = KDTree(uv % 1.0)
+            for key, (height, width) in textures.items():
+                y, x = np.indices((height, width)).reshape(2, -1)
+                of[key] = np.asarray(nearest.query(np.stack([(x + 0.5) / width, (y + 0.5) / height], axis=1))[1])
+        return cls(of, (len(vertices),), faces)
+
+    def neighbour_means(self, values: np.ndarray) -> np.ndarray:
+        """Return the means of values (cells, ...) over the neighbours of each cell, that cell included."""
+        if self.faces is None:
+            return neighbour_means(values.reshape(*self.shape, -1), channels=True).reshape(values.shape)
+        from scipy.sparse import coo_matrix, eye  # takes long to import
+
+        one, other = (np.ravel(self.faces[:, order]) for order in ([0, 1, 2, 1, 2, 0], [1, 2, 0, 0, 1, 2]))
+        count = len(values)
+        near = eye(count) + coo_matrix((np.ones(len(one)), (one, other)), (count, count))
+        return (near @ values.reshape(count, -1) / np.ravel(near.sum(axis=1))[:, None]).reshape(values.shape)
 
 
 def _aligned(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (H, W, F) with signs that bring them closest to one direction: those of eigenvectors are arbitrary."""
-    flat = vectors.reshape(-1, vectors.shape[-1])
-    main = np.linalg.eigh(flat.T @ flat)[1][:, -1]
-    return vectors * np.where(vectors @ main < 0.0, -1.0, 1.0)[..., None]
+    """Return vectors (cells, F) with signs that bring them closest to one direction: those of eigenvectors are arbitrary."""
+    main = np.linalg.eigh(vectors.T @ vectors)[1][:, -1]
+    return vectors * np.where(vectors @ main < 0.0, -1.0, 1.0)[:, None]
