@@ -108,6 +108,9 @@ def tinted():
 asked = ur.Problem(tinted, [ur.Parameter("wall.bsdf.tint", 0.5, bounds=(0, 1))], wall.original_views, max_depth=2,
                    truth={"wall.bsdf.tint": [0.6, 0.4, 0.3]})
 found["BSDF"] = error(asked, ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2), adam, 40)
+scene = ur.app.export((asked, {"wall.bsdf.tint": [0.1, 0.2, 0.3]}), sys.argv[3] + "-scene").scene
+import mitsuba as mi
+found["exported BSDF"] = [value[0] for value in mi.traverse(mi.load_file(str(scene)))["wall.bsdf.tint"]]
 print(json.dumps(found))
 '''  # fmt: skip
 
@@ -174,3 +177,4 @@ def test_each_computes_what_it_says(found: dict[str, Any]) -> None:
     assert found["derivative"] < 1e-6
     assert found["schedule"] == [0.5, 0.5]
     assert found["grey"] == [[1.5, 2.5]]
+    assert found["exported BSDF"] == pytest.approx([0.1, 0.2, 0.3])  # Mitsuba had no XML tag for plugins from Python

@@ -803,3 +803,12 @@ def test_ctrl_c_returns_what_was_reached() -> None:
     assert found.stopped == "interrupted"
     assert found.steps <= 5
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(("kind", "missing"), [("Estimator", "provides"), ("Optimizer", "requires")])
+def test_a_part_that_lacks_a_method_of_its_protocol_is_refused(kind: str, missing: str) -> None:
+    """Inherited from the protocol it returned None."""
+    part: Any = type("Mine", (getattr(ur.protocols, kind),), {})()
+    parts = (part, ur.optimizers.Adam()) if kind == "Estimator" else (ur.PathGradient(), part)
+    with pytest.raises(ur.InputError, match=f"Mine has no {missing}, which an {kind} needs"):
+        ur.optimize(problem(), *parts, steps=1)

@@ -213,6 +213,10 @@ def estimate(
 
 def check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:
     """Raise `InputError` if the optimizer requires what the estimator does not provide, or the budget is invalid."""
+    for part, protocol in ((estimator, Estimator), (optimizer, Optimizer)):
+        for name in vars(protocol):
+            if not name.startswith("_") and getattr(type(part), name, None) is getattr(protocol, name):
+                raise InputError(f"optimize: {type(part).__name__} has no {name}, which an {protocol.__name__} needs")
     missing = optimizer.requires - estimator.provides
     if missing:
         raise InputError(

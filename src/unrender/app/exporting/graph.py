@@ -19,6 +19,7 @@ import numpy as np
 
 from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, new_file
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 from unrender.io import images
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
@@ -27,6 +28,7 @@ from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 _LABEL = re.compile(r"n(\d+)")
 _MARK = "unrender_node"
+_IN_PYTHON = ("BSDF", "Emitter", "Texture", "Medium", "PhaseFunction", "Sensor", "Film", "Shape", "Volume")
 _NAMELESS = re.compile(r"|object_\d+|_.*|elm__\d+")
 _Kind = mi.Properties.Type
 
@@ -65,11 +67,13 @@ class SceneGraph:
         except Exception as error:
             raise InputError(f"scene: its description cannot be read: {' '.join(str(error).split())[:400]}") from error
         self.nodes: Any = self._state.nodes
-        for emitter in self._scene.emitters():  # the parser does not know the object type of plugins in Python
-            if (label := _LABEL.fullmatch(emitter.id())) and self.nodes[int(label[1])].type == mi.ObjectType.Unknown:
-                self.nodes[int(label[1])].type = mi.ObjectType.Emitter
+        objects = ObjectGraph(self._scene)
+        for each in objects.nodes:  # the parser does not know the object type of plugins in Python
+            if (label := _LABEL.fullmatch(each.id())) and self.nodes[int(label[1])].type == mi.ObjectType.Unknown:
+                kinds = [kind for kind in _IN_PYTHON if isinstance(each, getattr(mi, kind))]
+                self.nodes[int(label[1])].type = getattr(mi.ObjectType, kinds[0] if kinds else "Unknown")
         self.names = [node.props.id() for node in self.nodes]
-        self.live = ObjectGraph(self._scene).parameters()  # the same keys as the parameters of a problem
+        self.live = objects.parameters()  # the same keys as the parameters of a problem
 
     @property
     def root(self) -> Any:
@@ -147,11 +151,14 @@ class SceneGraph:
     # ------------------------------------------------------------------ writing
 
     def xml(self) -> bytes:
-        """Return the description as Mitsuba's XML."""
+        """Return the description as Mitsuba's XML. Raises `InputError` for what Mitsuba cannot write."""
         for index, node in enumerate(self.nodes):
             node.props.set_id(f"n{index}")
             node.props[_MARK] = str(index)
-        root = ElementTree.fromstring(mi.parser.write_string(self._state))
+        try:
+            root = ElementTree.fromstring(mi.parser.write_string(self._state))
+        except RuntimeError as error:
+            raise InputError(f"export: Mitsuba cannot write this scene as XML: {reason_of(error, 300)}") from error
         elements: dict[int, ElementTree.Element] = {}
         for element in root.iter():
             for mark in [child for child in element if child.get("name") == _MARK]:
