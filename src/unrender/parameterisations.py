@@ -11,6 +11,7 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import in_words, reason_of
 
 __all__ = ["Identity", "Log", "Parameterisation"]
 
@@ -102,3 +103,21 @@ def _lower(bounds: Bounds) -> float:
         shown = "open" if high is None else f"{high:g}"
         raise InputError(f"log needs a lower bound, got bounds open to {shown}; give bounds, such as [0, inf]")
     return low
+
+
+def check_transform(transform: Transform, x: np.ndarray) -> None:
+    """Raise `InputError` unless inverse, slope and curvature belong to `forward` at values x: else steps and standard errors would be wrong
+    by factors that nothing shows."""
+    x, h = np.asarray(x, np.float64), 1e-3
+    try:
+        u, slope = transform.inverse(x), transform.slope(x)
+        below, here, above = (np.asarray(transform.forward(u + offset)) for offset in (-h, 0.0, h))
+        differences = {"inverse": here - x, "slope": (above - below) / (2 * h) - slope}
+        if hasattr(transform, "curvature"):
+            slopes = np.asarray(transform.slope(above)) - np.asarray(transform.slope(below))
+            differences["curvature"] = slopes / (2 * h) - transform.curvature(x)
+        wrong = [name for name, each in differences.items() if not np.median(np.abs(each) - 0.01 * slope) <= 0]
+    except Exception as error:  # of any function of the user's
+        raise InputError(f"its transform, {in_words(transform)}, fails: {reason_of(error, 300)}") from error
+    if wrong:
+        raise InputError(f"{type(transform).__name__}.{wrong[0]} does not belong to its forward, or forward decreases")

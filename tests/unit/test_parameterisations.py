@@ -337,3 +337,21 @@ def test_bad_ones_are_one_line(given: Any, bounds: Any, message: str) -> None:
         problem(given, bounds)
     assert "\n" not in str(error.value)
     assert "parameter colour: parameterisation" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["inverse", "slope", "curvature", "forward", "transform"])
+def test_a_map_of_ones_own_that_is_not_consistent_is_refused(name: str) -> None:
+    """A slope that is five times too large, or a wrong inverse, passed: the run ended as worse than its start, or with wrong errors."""
+    transform: Any = Log().transform((0.0, 1.0), START)
+    right = getattr(transform, name, None)
+    wrong = (lambda v: 5.0 * right(v) + 1.0) if name != "forward" else (lambda v: right(-v))
+    mine: Any = type(
+        "Mine",
+        (),
+        {each: staticmethod(getattr(transform, each)) for each in ("forward", "inverse", "slope", "curvature")},
+    )
+    setattr(mine, name, staticmethod(wrong))
+    rule = type("Rule", (), {"transform": lambda self, bounds, initial: 3 if name == "transform" else mine()})()
+    message = "its transform, 3, fails" if name == "transform" else "Mine.(inverse|slope|curvature) does not belong"
+    with pytest.raises(ur.InputError, match=f"parameter colour: parameterisation: {message}"):
+        problem(rule, (0, 1))

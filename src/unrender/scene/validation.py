@@ -19,7 +19,7 @@ from unrender.core.text import did_you_mean, in_words, listed, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.io.toml_lines import FieldError
 from unrender.losses import FunctionLoss, Loss
-from unrender.parameterisations import Bounds, Parameterisation, Transform
+from unrender.parameterisations import Bounds, Parameterisation, Transform, check_transform
 from unrender.preconditioners.base import Preconditioner, bound_to
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
@@ -209,7 +209,10 @@ def _check_parameterisation(
     )
     if isinstance(made, type) or not isinstance(made, Parameterisation):
         raise InputError(f"expected one of unrender.parameterisations, or its name, got {in_words(parameterisation)}")
-    return made, made.transform(bounds, initial)
+    transform = made.transform(bounds, initial)
+    if transform is not None:
+        check_transform(transform, project(initial, *bounds, open_scale(initial)))
+    return made, transform
 
 
 def mesh_topology(info: ParameterInfo | None) -> MeshTopology | None:
