@@ -238,6 +238,10 @@ def test_bad_input_is_one_line(order: str) -> None:
         ((f, 0.0, 0.1, 64), r"theta must be a finite vector"),
         ((f, [0.0, np.nan], 0.1, 64), r"theta must be a finite vector"),
         ((f, [0.0, 0.0], 0.1, 2), "samples must be a whole number of at least 4"),
+        ((f, [0.0, 0.0], "a", 64), r"sigma must be a finite number or a vector \(2,\), got 'a'"),
+        ((f, [0.0, 0.0], 0.1, 64, -1), "seed must be a whole number of at least 0, got -1"),
+        ((3, [0.0, 0.0], 0.1, 64), r"f must be a function of points \(B, n\), got 3"),
+        ((lambda x: x[:, 0] * 1j, [0.0, 0.0], 0.1, 64), "f must return numbers"),
         ((lambda x: x, [0.0, 0.0], 0.1, 64), r"f must return shape \(\d+,\)"),
         ((lambda x: x[:, 0] * np.nan, [0.0, 0.0], 0.1, 64), "f is not finite at"),
     ]:

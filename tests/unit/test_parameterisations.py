@@ -343,7 +343,7 @@ def test_bad_ones_are_one_line(given: Any, bounds: Any, message: str) -> None:
 def test_a_map_of_ones_own_that_is_not_consistent_is_refused(name: str) -> None:
     """A slope that is five times too large, or a wrong inverse, passed: the run ended as worse than its start, or with wrong errors."""
     transform: Any = Log().transform((0.0, 1.0), START)
-    right = getattr(transform, name, None)
+    right: Any = getattr(transform, name, None)
     wrong = (lambda v: 5.0 * right(v) + 1.0) if name != "forward" else (lambda v: right(-v))
     mine: Any = type(
         "Mine",

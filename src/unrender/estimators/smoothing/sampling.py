@@ -42,6 +42,8 @@ _ORTHOGONAL = 1 << 20  # stream of random numbers for orthogonal samples
 def numbers(values: Any, expected: str) -> np.ndarray:
     """Return a new array of float64. Raises `InputError` that begins with `expected` for anything but numbers."""
     try:
+        if np.iscomplexobj(values):  # NumPy would drop the imaginary parts
+            raise TypeError
         return np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{expected}, got {in_words(values)}") from error
@@ -62,7 +64,10 @@ class SmoothedFunction:
     """
 
     def __init__(self, name: str, f: Function, theta: Any, sigma: Any, options: SamplingOptions, sides: int = 1):
-        self.owner, self.f, self.seed = f"smoothed.{name}", f, options.seed
+        self.owner, self.f = f"smoothed.{name}", f
+        if not callable(f):
+            raise InputError(f"{self.owner}: f must be a function of points (B, n), got {in_words(f)}")
+        self.seed = checks.integer(self.owner, "seed", options.seed, 0, (1 << 63) - 1)
         self.theta = numbers(theta, f"{self.owner}: theta must be a finite vector (n,)")
         if self.theta.ndim != 1 or self.theta.size == 0 or not np.isfinite(self.theta).all():
             raise InputError(f"{self.owner}: theta must be a finite vector (n,), got shape {self.theta.shape}")
@@ -80,11 +85,10 @@ class SmoothedFunction:
 
     def vector(self, name: str, value: Any) -> np.ndarray:
         """Return a finite vector (n,) from a number or a vector."""
-        array = np.array(value, np.float64)
+        expected = f"{self.owner}: {name} must be a finite number or a vector ({self.n},)"
+        array = numbers(value, expected)
         if array.shape not in ((), (self.n,)) or not np.isfinite(array).all():
-            raise InputError(
-                f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {in_words(value)}"
-            )
+            raise InputError(f"{expected}, got {in_words(value)}")
         return np.broadcast_to(array, (self.n,)).copy()
 
     def direction(self, v: Any) -> tuple[np.ndarray, float]:
