@@ -502,7 +502,8 @@ def test_references_that_are_turned_or_exchanged_are_named(change: Any, words: s
     [
         ((1.0, 1.5, 1.2), 0, "as if the reference of view 1 were 1.5 times as bright as that of view 0"),
         ((0.9, 1.0, 0.5), 0, "as if the reference of view 1 were 2 times as bright as that of view 2"),
-        ((1.0, 1.1, 1.0), 0, ""),
+        ((1.0, 1.1, 1.0), 0, "as if the reference of view 1 were 1.1 times as bright as that of view 0"),
+        ((1.0, 1.02, 1.0), 0, ""),
         ((1.3, 1.3, 1.3), 0, ""),
         ((1.0, 1.3, 1.0), 6, ""),
         ((1.0, 0.0, 1.0), 0, ""),
