@@ -271,7 +271,7 @@ class _Fit:
         along = -inverse @ np.where(hidden, 0.0, np.tensordot(slopes, residual, axes=2))
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
         total = covariance(*scores.without_own_pixel(after, slopes, slopes, inverse))
-        total *= 1.0 if residual.size > len(total) else math.inf
+        total = total if residual.size > len(total) else np.full_like(total, np.inf)
         left = 0.5 * (after[0] + after[1])  # the noise of the slopes moves the solution, too
         noises = covariance(noise, noise) + covariance(left, left, 0.5 * (differences.one - differences.other))
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, noises))
@@ -372,7 +372,10 @@ def _distorted(numbers: Numbers, fit: _Fit, of_step: np.ndarray, refuted: bool) 
     numbers explain, or about pictures with as many values as numbers; "" for none. Where numbers have not settled, or are `refuted`, their
     pictures may differ as if so."""
     if numbers.references().size == numbers.count:  # a fit leaves no residual, which tells the references' noise
-        return f"{listed(numbers.keys)}: no standard errors: the pictures have as few values as these numbers; add pixels or views"
+        return (
+            f"{listed(numbers.keys)}: no standard errors: the pictures have as few values as these numbers, of which others may give the "
+            "same pictures; add pixels or views"
+        )
     line = f"{listed(numbers.keys)}: no standard errors: the pictures differ from the references "
     # What a step leaves of the pictures may be its curvature, however small a part of the number's range it is.
     unsettled = refuted or bool((np.abs(fit.step) > _STEP_ERRORS * of_step).any())
