@@ -35,11 +35,23 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
+def _own_settings() -> Iterator[None]:
+    """Undo `suspend_grad`, with which gradients are 0, and packet operations where `JitFlag.Debug` is set: it drops valid writes of packets
+    (Dr.Jit 1.5), and with them a part of the gradients of textures."""
+    if (dr := sys.modules.get("drjit")) is None:
+        yield
+        return
+    packets = dr.flag(dr.JitFlag.PacketOps) and not dr.flag(dr.JitFlag.Debug)
+    with dr.resume_grad(), dr.scoped_set_flag(dr.JitFlag.PacketOps, packets):
+        yield
+
+
+@contextlib.contextmanager
 def exclusive(what: str, long: bool = False) -> Iterator[None]:
     """Serialise calls from different threads, as a decorator or in a `with` statement. Calls within one thread may nest.
 
     A call waits for the other thread's call to end. It raises `InputError` instead if the other call is marked `long`: it may take hours,
-    as a run does. The caller's `dr.suspend_grad()` does not apply within: gradients would be 0.
+    as a run does. Settings of the caller that would change gradients do not apply within.
     """
     me = threading.current_thread()
     with _turn.changed:
@@ -53,8 +65,7 @@ def exclusive(what: str, long: bool = False) -> Iterator[None]:
         _turn.thread = me
         _turn.doing.append((what, long))
     try:
-        # Before the import of Dr.Jit nothing can be suspended.
-        with sys.modules["drjit"].resume_grad() if "drjit" in sys.modules else contextlib.nullcontext():
+        with _own_settings():
             yield
     finally:
         with _turn.changed:
