@@ -437,6 +437,20 @@ def test_a_rare_bright_sample_that_hides_a_slope_leaves_its_number_without_a_sta
         assert not found.noisy(("b",))
 
 
+def test_numbers_move_along_with_an_open_one_that_they_trade_off_against():
+    """A base colour was .0107 away beside an open clearcoat, with an error of .0022: the open direction was that of noisier pictures."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    slopes, rng = 0.1 * MATRIX.T.reshape(4, -1, 3), np.random.default_rng(1)
+    slopes[3] = 0.4 * slopes[0]
+    one, other = slopes + np.array([0.0, 0.0, 0.0, 0.2])[:, None, None] * rng.normal(size=(2, *slopes.shape))
+    residuals = np.tile(rng.normal(0.0, 0.5, slopes.shape[1:]), (2, 1, 1))
+    residuals[1, 0] += 0.1
+    fit = _Fit.of(numbers, Differences(0.1 * np.eye(4), one, other), residuals)
+    np.testing.assert_allclose(fit.unseen[:, 0], [-0.04, 0.0, 0.0, 0.1], atol=0.015)
+
+
 def test_noise_of_the_test_leaves_no_number_open_of_which_the_run_knows_the_error(monkeypatch: Any):
     """Radiances of lamps that the run knew to a percent were "determined to ± 8.02 or more", since a short test did not see a slope."""
     made = problem(MATRIX)

@@ -47,7 +47,10 @@ _OUTLIER = 100.0
 """Ratio of a gradient's variance by noise to the mean one from which on it is left out, once at a time: noise may have grown. Weighted by
 its inverse variance it would add at most 1 % to what is known."""
 _WEAK_SHARE = 0.01
-"""Squared share of an element in damped directions above which its standard error is infinite."""
+"""Squared share of an element in damped or unresolved directions above which its standard error is infinite."""
+_RESOLVED = 8.0
+"""Curvature relative to what noise would add to it below which it may be noise, and so the errors that follow from it. Source: 17 problems
+of few numbers, 2 to 5 seeds: below it, 2 of 13 runs ended at 4.2 and 5.3 of their errors, above it 1 of 39 at more than 3.1."""
 _OF_LINEAR = 1e4
 """Factor of the trust region along parameters in which images are linear."""
 _OF_WIDTH = 0.1
@@ -223,9 +226,9 @@ class AveragedNewton:
         """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
         They cover the noise of the run and of the references, not the bias of finite differences. They are infinite for elements that
-        change no image, and for those with a share in a damped direction, which the images hardly determine. {} if the last estimate has
-        no `ScoreCovariance`. Parameters with fewer than 8 effective models, with models without noise, or still on the way to A⁻¹ b in a
-        trust region that limits their steps, are omitted.
+        change no image, and for those with a share in a direction that is damped, or whose curvature may be noise. {} if the last estimate
+        has no `ScoreCovariance`. Parameters with fewer than 8 effective models, with models without noise, or still on the way to A⁻¹ b in
+        a trust region that limits their steps, are omitted.
         """
         if state.scores is None:
             return {}
@@ -252,7 +255,9 @@ class AveragedNewton:
             if not np.diag(state.matrix[both]).all():
                 continue
             scales, eigenvalues, directions = scaled_eigh(state.matrix[both])
-            weak = eigenvalues <= self.damping * eigenvalues.max()
+            rough = state.shares[block].max() * state.noise[both] / scales
+            hidden = _RESOLVED * np.einsum("ki,kl,li->i", directions, rough, directions)
+            weak = eigenvalues <= np.maximum(self.damping * eigenvalues.max(), hidden)
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / scales
             middle = state.scatter[both] + (0.0 if state.scores is None else positive_part(state.scores[both]))
             error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))

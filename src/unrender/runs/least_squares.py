@@ -246,6 +246,7 @@ class _Fit:
         matrix, (squares, errors) = differences.matrix(), differences.squares()
         # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
         hidden = squares <= _ERRORS * errors + _ROUNDING * float(np.abs(squares).max())
+        shared = np.where(hidden, matrix, 0.0)
         matrix[hidden, :] = matrix[:, hidden] = 0.0
         least = 1e-12 * float(np.abs(squares).max()) + 1e-200
         np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + least, np.diag(matrix)))
@@ -284,11 +285,12 @@ class _Fit:
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~(numbers.rigid | numbers.settled)[:, None] & comparable)
-        unseen = changes[:n] * (hidden[None] & open_)
+        # What the other directions explain of a hidden one belongs to it: numbers that trade off against it move along.
+        seen_inverse = np.where(hidden, 0.0, inverse)
+        unseen = (changes - changes @ seen_inverse @ shared)[:n] * (hidden[None] & open_)
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
         seen = np.where(hidden[:, None, None], 0.0, slopes)
-        seen_inverse = np.where(hidden, 0.0, inverse)
         looks_like = distortions_of_fit(numbers, residuals, after, seen, seen_inverse)
         distortions = [(words, changes[:n] @ moves) for words, moves in looks_like]
         return cls(
