@@ -22,6 +22,7 @@ from unrender.app.capture.cameras import FISHEYE, Lens, project
 from unrender.app.capture.capture import reinterpreted
 from unrender.app.capture.importing import ImportOptions
 from unrender.app.capture.views import prepare
+from unrender.core.errors import InputError
 from unrender.io import images
 
 CENTRED = Lens(48, 40, 60.0, 60.0, 24.0, 20.0)
@@ -99,6 +100,15 @@ def test_a_shift_of_a_fraction_of_a_pixel_would_be_seen(mesh: Path, tmp_path: Pa
     shown = _references(tmp_path / "problem")
     for picture, (reference, mask) in zip(_normals(tmp_path / "problem"), shown, strict=True):
         assert np.abs(picture - reference)[mask].mean() > 0.006
+
+
+def test_colmap_images_without_their_lines_of_points_are_refused(tmp_path: Path) -> None:
+    """Every second image was taken for such a line: half of the photographs were skipped."""
+    made.write_colmap(tmp_path, made.shots(None, RADIAL), RADIAL, binary=False)
+    file = tmp_path / "sparse/0/images.txt"
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if line and not line.startswith("1.5")))
+    with pytest.raises(InputError, match=r"images\.txt:3: expected the points of the image before"):
+        formats.read(tmp_path)
 
 
 @pytest.mark.slow

@@ -166,6 +166,11 @@ def _text_images(path: Path) -> Iterator[_Image]:
     """Yield the images, which are every second line. The other lines list points, and may be empty."""
     for index, (number, line) in enumerate(_lines(path)):
         if index % 2:
+            words = line.split()
+            if len(words) % 3 or (words and not words[-1].lstrip("-").isdigit()):
+                raise InputError(
+                    f"{path}:{number}: expected the points of the image before, X Y POINT3D_ID each, or an empty line"
+                )
             continue
         words = line.split(None, 9)
         if not words:
