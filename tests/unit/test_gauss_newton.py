@@ -448,7 +448,7 @@ class Residuals(Callback):
 
 def test_mean_residuals_are_kept_only_for_an_optimizer_that_states_errors() -> None:
     """Of 20 pixels, 24 bytes each, as many for an earlier image, and the Hessian. A checkpoint of the others has the three parameters of
-    the last step alone."""
+    the last step and the Hessian."""
     seen = {}
     for optimizer in (AveragedNewton(), ur.optimizers.Newton()):
         one = seen[type(optimizer)] = Residuals()
@@ -456,7 +456,7 @@ def test_mean_residuals_are_kept_only_for_an_optimizer_that_states_errors() -> N
     assert seen[AveragedNewton].kept == {20 * 24}
     assert seen[AveragedNewton].stored == {2 * 20 * 24 + 9 * 8 + points * 3 * 8 for points in (1, 2)}
     assert seen[ur.optimizers.Newton].kept == {0}
-    assert seen[ur.optimizers.Newton].stored == {3 * 8}
+    assert seen[ur.optimizers.Newton].stored == {3 * 8 + 9 * 8}
 
 
 @pytest.mark.mitsuba  # which a run folder asks for its version

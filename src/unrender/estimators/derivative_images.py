@@ -19,6 +19,8 @@ _MEMORY, _CHANNEL_MEMORY = 0.3, 0.1
 """Weight of the latest image in the running mean of the variance of a pixel, and of one of its channels, which has more noise itself."""
 LAUNCH = 1 << 13
 """Time of starting a render, in that of paths: 4,000 to 19,000 on two cores, for four scenes of `suite.numbers`."""
+_WEAK, _LONGEST, _MOST_WEAK = 0.1, 4.0, 16
+"""Eigenvalue, relative to the mean one, below which a direction is weak; length of its differences in widths; most weak directions."""
 _GROWTH = 1.0  # weights of derivative images in their mean grow as this power of their number
 
 
@@ -211,16 +213,54 @@ def squared_slope(halves: list[np.ndarray]) -> float:
     return 0.5 * sum(float((np.diff(one, axis=axis) * np.diff(other, axis=axis)).sum()) for axis in (0, 1))
 
 
-def differences(images: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return derivative images (m, H, W, 3) from images (2 m, H, W, 3), first those of increased, then those of decreased parameters.
+def directions(hessian: np.ndarray | None, widths: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Return the directions of central differences, one per row, (m, m): widths of single elements, or weak directions in their place.
+
+    Elements that change the pictures almost alike have weak directions, along which they cancel, such as a move along the light that casts
+    a shadow. Differences of single elements do not tell how pictures change along them, since each has another error of its own. So
+    there, the last element of the largest share moves together with the others.
 
     Args:
-        distances: distance of the two parameters of each difference, (m,); an element with 0 has no derivative.
+        hessian: Gauss-Newton matrix (m, m); None if it is unknown.
+        widths: widths of differences by single elements, (m,).
+        largest: largest change of each element, (m,); infinite for no limit.
     """
-    over = np.divide(1.0, distances, out=np.zeros(distances.size), where=distances != 0.0)
-    return ((images[: over.size].astype(np.float64) - images[over.size :]) * over[:, None, None, None]).astype(
-        np.float32
-    )
+    rows = np.diag(widths)
+    if hessian is None or not np.isfinite(hessian).all():
+        return rows
+    changes = widths[:, None] * hessian * widths
+    units = np.sqrt(np.maximum(np.diag(changes), 0.0))
+    if not units.all():
+        return rows
+    values, vectors = np.linalg.eigh(changes / np.outer(units, units))
+    weak = np.flatnonzero(values < _WEAK)[:_MOST_WEAK]
+    if not weak.size:
+        return rows
+    from scipy.linalg import qr
+
+    replaced = qr(vectors[:, weak].T, mode="r", pivoting=True)[-1][: weak.size]
+    moves = (vectors[:, weak] / units[:, None]).T * units.mean() * widths
+    moves /= np.sqrt(np.maximum(values[weak], _LONGEST**-2))[:, None]
+    rows[replaced] = moves / np.maximum(np.abs(moves / largest).max(axis=1, keepdims=True), 1.0)
+    return rows
+
+
+def differences(images: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Return derivative images (m, H, W, 3) from images (2 m, H, W, 3), first those of one end of each move, then those of the other.
+
+    Args:
+        moves: differences of the elements between both ends, one move per row, (m, m). A row with a single element gives the derivative by
+            this element. Other rows give it together with these. An element that does not move has none.
+    """
+    changes = images[: len(moves)].astype(np.float64) - images[len(moves) :]
+    single = np.count_nonzero(moves, axis=1) <= 1
+    own = np.diag(moves)
+    over = np.divide(1.0, own, out=np.zeros(own.size), where=single & (own != 0.0))
+    derivatives = changes * over[:, None, None, None]
+    if not single.all():
+        rest = changes[~single] - np.tensordot(moves[np.ix_(~single, single)], derivatives[single], axes=1)
+        derivatives[~single] = np.tensordot(np.linalg.pinv(moves[np.ix_(~single, ~single)]), rest, axes=1)
+    return derivatives.astype(np.float32)
 
 
 def products(

@@ -63,7 +63,7 @@ class GaussNewtonState:
             before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
         residuals: mean derivatives of the loss of each view, moved along to `point`; () without scores and before the first estimate.
-        hessian: last Hessian, (n, n); None without scores and before the first estimate.
+        hessian: last Hessian, (n, n); None before the first estimate.
         images: effective number of images since the last long step.
         origin: parameters of the last derivative images, (n,); None before the first estimate.
         noise: noise of the mean derivative images relative to the derivatives, averaged over directions.
@@ -106,6 +106,7 @@ class GaussNewton:
 
     J is the central difference of renders with the same random numbers, at ± a width. The width of each parameter is chosen so that
     both renders differ from the image as much as a shift by `shift` pixels would. It is also the unit of trust regions (`Smoothing`).
+    Poses, positions and lenses whose sums hardly change the images, by the last H, have differences along these sums.
     Images and derivative images have independent samples. H is the symmetrised product of two independent halves of the derivative
     images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`). The mean
     residuals of two halves of all images give the gradient's covariance from the references' noise (`ScoreCovariance`).
@@ -292,7 +293,7 @@ class GaussNewton:
             derivatives=tuple(system.derivatives) or state.derivatives,
             residuals=tuple(system.residuals),
             pictures=tuple(system.pictures),
-            hessian=system.products.hessian if system.residuals else None,
+            hessian=system.products.hessian if system.images else None,
             origin=point.theta if system.fresh else state.origin,
             differenced=state.widths if system.derivatives and begins else state.differenced,
             noise=_relative_noise(system.products.hessian, system.products.noise),

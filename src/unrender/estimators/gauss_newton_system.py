@@ -19,6 +19,7 @@ from unrender.estimators.derivative_images import (
     LossWeights,
     Products,
     differences,
+    directions,
     mean_residuals,
     noise_weights,
     products,
@@ -94,6 +95,10 @@ class Point:
         }
         known = problem.renderer.parameters()
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
+        # No picture depends on the length of a direction, which says nothing of its own error.
+        other = (key for key, info in known.items() if info.scattering or info.role in ("direction", "ratios"))
+        edges = {key: info.rigid or info.nonlinear for key, info in known.items()} | dict.fromkeys(other, False)
+        self._edges = trees.repeat_per_element(edges, parameters) > 0.0
         self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
     def since(self, before: np.ndarray | None, state: GaussNewtonState) -> tuple[np.ndarray, float]:
@@ -161,10 +166,10 @@ class Point:
         if before is not None and not total.fresh:
             mean = before
         else:
-            points, distances = self._points(elements, steps)
+            points, moves = self._points(elements, self._offsets(elements, steps, state.hessian))
             halves = [self._states(points, view, key.fold(half), self.options.derivative_spp) for half in (0, 1)]
             total.slopes[elements] += squared_slope(halves)
-            mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
+            mean = HalvesMean(differences(halves[0], moves), differences(halves[1], moves))
             mean = before.and_one(mean, self.since(state.origin, state)[1]) if before else mean
         if averaged:
             total.derivatives.append(mean)
@@ -186,18 +191,28 @@ class Point:
         )
         return weights.times(noise_weights(state.variances[view], limit)) if state.variances else weights
 
-    def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parameters with one element increased, then decreased, by its step, (2 m, n), within bounds, and the distances of
-        both, (m,)."""
+    def _offsets(self, elements: np.ndarray, steps: np.ndarray, hessian: np.ndarray | None) -> np.ndarray:
+        """Return the rows by which differences move elements, (m, m): `steps` (n,) of one, or weak directions of those that move edges.
+
+        Where pictures are smooth, differences by single elements have no error that sums of them show.
+        """
+        rows, edges = np.diag(steps[elements]), self._edges[elements]
+        if hessian is not None and edges.any():
+            moved, limits = elements[edges], trees.repeat_per_element(self.largest, self.parameters)
+            rows[np.ix_(edges, edges)] = directions(hessian[np.ix_(moved, moved)], steps[moved], limits[moved])
+        return rows
+
+    def _points(self, elements: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters plus, then minus, each row of the offsets of some elements (m, m), within bounds, (2 m, n), and the
+        differences of the elements between both, (m, m)."""
         unknowns = self.problem.unknowns
-        offsets = np.zeros((2, elements.size, self.theta.size))
-        offsets[0, np.arange(elements.size), elements] = steps[elements]
-        offsets[1, np.arange(elements.size), elements] = -steps[elements]
-        states = trees.parts(self.theta + offsets, self.parameters)
+        both = np.zeros((2, elements.size, self.theta.size))
+        both[0, :, elements], both[1, :, elements] = offsets.T, -offsets.T
+        states = trees.parts(self.theta + both, self.parameters)
         inside = [unknowns[key].project(x).reshape(*x.shape[:2], -1) for key, x in states.items()]
         points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
-        distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
-        return points.reshape(-1, self.theta.size), distances
+        moves = (points[0] - points[1])[:, elements]
+        return points.reshape(-1, self.theta.size), moves
 
     def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         """Render images (B, H, W, 3) at points (B, n) with half of the samples, all with the same random numbers."""

@@ -27,12 +27,25 @@ _INDEPENDENT = 1e-3
 """Eigenvalue relative to the largest below which a direction changes the pictures as the others do."""
 _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
+_WEAKEST = 1e-4  # smallest eigenvalue, relative to the largest, that the length of a direction follows
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
 _SHORTENED, _NARROW, _CURVED, _CURVED_ERRORS = 3, 0.25, 0.5, 3.0
 """Most rounds of shorter differences, and their ratio; relative change of slopes, and errors beyond it, from which they are too long."""
 _LATE, _UNRESOLVED = "the run is too short for this test", "whose share in the pictures is not resolved"
 """Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
+
+
+def independent(differences: Differences, limits: np.ndarray, change: float) -> tuple[np.ndarray, float]:
+    """Return factors (K, K) of directions whose sums change pictures independently, within limits (n,), and the least eigenvalue."""
+    matrix, (_, errors) = differences.matrix(), differences.squares()
+    units = np.sqrt(np.maximum(np.maximum(np.diag(matrix), errors), 1e-12 * np.abs(matrix).max() or 1.0))
+    eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
+    least = max(_WEAKEST * eigenvalues.max(), 1e-30)  # noise may leave no positive one
+    lengths = change * np.sqrt(differences.one[0].size / np.maximum(eigenvalues, least))
+    factors = vectors * lengths / units[:, None]
+    longer = np.maximum(np.max(np.abs(differences.directions @ factors) / limits[:, None], axis=0), 1.0)
+    return factors / longer, float(eigenvalues[0])
 
 
 def narrowed(

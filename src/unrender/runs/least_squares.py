@@ -16,9 +16,9 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
-from unrender.runs.field_directions import add_field_directions, fields_of, narrowed
+from unrender.runs.field_directions import add_field_directions, fields_of, independent, narrowed
 from unrender.runs.image_sensitivity import shown_elsewhere
-from unrender.runs.numbers import Differences, Numbers, NumbersCheck
+from unrender.runs.numbers import ERRORS, Differences, Numbers, NumbersCheck
 from unrender.runs.reference_distortions import distortions_of_fit
 from unrender.runs.verification import SMOOTH, compares, unexplained_share
 from unrender.scene.problem import Problem
@@ -30,19 +30,15 @@ _PASSES, _REPEATS, _CHANGES = 3, 8, (64.0, 8.0, 4.0)
 """Passes that find widths, most repeats of the pictures that are judged, and the factors by which widths change at most."""
 _FIRST_WIDTH, _SHIFT = 0.02, 0.3
 """First widths of differences, relative to their limits; shift of the picture, in pixels, that a difference is as large as."""
-_WEAKEST = 1e-4  # smallest eigenvalue, relative to the largest, that the length of a direction follows
 _FLAT, _COMPARABLE = 0.1, 0.3
 """Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined;
 noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
 _CHANNELS = 3.0  # channels that share their noise
-_ERRORS, _ROUNDING = 3.0, 1e-10
-"""Standard errors by which the change along a direction must exceed its noise; square of one, relative to the largest, left by rounding."""
 _DOUBTFUL = 0.1  # standard error, as a share of a number's size, from which on it is undetermined
 _FURTHER, _STEP_ERRORS = 0.05, 4.0  # least step reported: share of a number's size, standard errors
 _OF_WIDTHS, _TOGETHER = 10.0, 0.9
 """Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
-_ROUNDS, _WEAK = 3, 0.3
-"""Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
+_ROUNDS, _WEAK = 3, 0.1  # most rounds that measure weak directions again, and their largest eigenvalue
 _DISTORTED = 2.0  # standard errors by which a distortion of the references must move a number that has none then
 _FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
 """Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
@@ -135,8 +131,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
         zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
         return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
-    began, latest = timing.now(), math.inf if timing.counts() else until - 3.0 * longest
-    differences, limits = narrowed(numbers, differences, key.fold(_SHORT), latest)
+    began, last = timing.now(), math.inf if timing.counts() else until - 3.0 * longest
+    differences, limits = narrowed(numbers, differences, key.fold(_SHORT), last)
     # Counted renderings need not keep a time, and without those that told nothing new, noise hid numbers that it had not hidden.
     until += (timing.now() - began) * timing.counts()
     moved, fixed = fields_of(numbers, sensitivities)
@@ -148,17 +144,20 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         numbers, differences, missing = extended
         fixed |= dict.fromkeys(moved, missing) if missing else {}
     limits = np.append(np.minimum(limits, numbers.limits[: numbers.count]), numbers.limits[numbers.count :])
-    directions, length = _directions(differences, limits, change)
-    for index in range(_ROUNDS):  # short differences hardly tell weak directions from their sums with others
-        if length > _WEAK or timing.now() + 4.0 * longest > until:
+    short = (limits < numbers.limits).any()
+    latest, (factors, share) = differences, independent(differences, limits, change)
+    for index in range(_ROUNDS):  # differences that nearly cancel do not tell how the pictures change along their sum
+        if share > _WEAK or (short and latest.hidden().any()) or timing.now() + 4.0 * longest > until:
             break
-        again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
-        directions, length = _directions(again, limits, change)
-    judged = _repeated(numbers, directions, key, until - 2.0 * longest)
-    squares, errors = judged[0].squares()
-    if (limits < numbers.limits).any() and (squares <= _ERRORS * errors).any():  # noise hides short differences
-        judged = _repeated(numbers, _directions(differences, numbers.limits, change)[0], key, until - 2.0 * longest)
-    check = _checked(numbers, _Fit.of(numbers, *judged), widths)
+        latest = numbers.differences(latest.directions @ factors, key.fold(_PASSES + 1 + _REPEATS + index))
+        factors, share = independent(latest, limits, change)
+    judged = _repeated(numbers, latest.directions @ factors, key, until - 2.0 * longest)
+    if short and judged[0].hidden().any():  # noise hides short differences
+        factors = independent(latest, numbers.limits, change)[0]
+        judged = _repeated(numbers, latest.directions @ factors, key, until - 2.0 * longest)
+    # Noise may hide how sums of these directions change the pictures.
+    mixed = judged[0].mixed(independent(judged[0], numbers.limits, change)[0])
+    check = _checked(numbers, _Fit.of(numbers, mixed, *judged[1:]), widths)
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed, distorted="", blind=()) if fixed else check
 
 
@@ -197,19 +196,6 @@ def _repeated(
     return differences, residuals / (repeats * count), before / repeats
 
 
-def _directions(differences: Differences, limits: np.ndarray, change: float) -> tuple[np.ndarray, float]:
-    """Return directions (n, n) along which the pictures change independently and by `change`, within the limits, and the least length that
-    these leave, relative to that wanted."""
-    matrix, (_, errors) = differences.matrix(), differences.squares()
-    units = np.sqrt(np.maximum(np.maximum(np.diag(matrix), errors), 1e-12 * np.abs(matrix).max() or 1.0))
-    eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
-    least = max(_WEAKEST * eigenvalues.max(), 1e-30)  # noise may leave no positive one
-    lengths = change * np.sqrt(differences.one[0].size / np.maximum(eigenvalues, least))
-    columns = differences.directions @ (vectors * lengths / units[:, None])
-    longer = np.maximum(np.max(np.abs(columns) / limits[:, None], axis=0), 1.0)
-    return columns / longer, 1.0 / float(longer.max())
-
-
 @dataclass(frozen=True)
 class _Fit:
     """Joint least-squares fit of n numbers and k directions of textures and grids.
@@ -245,11 +231,11 @@ class _Fit:
         """Fit differences along directions to two independent residuals (2, P, 3). `before` are those with the start's numbers."""
         matrix, (squares, errors) = differences.matrix(), differences.squares()
         # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
-        hidden = squares <= _ERRORS * errors + _ROUNDING * float(np.abs(squares).max())
+        hidden = differences.hidden()
         shared = np.where(hidden, matrix, 0.0)
         matrix[hidden, :] = matrix[:, hidden] = 0.0
         least = 1e-12 * float(np.abs(squares).max()) + 1e-200
-        np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + least, np.diag(matrix)))
+        np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + ERRORS * errors + least, np.diag(matrix)))
         units = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         inverse = np.linalg.pinv(matrix / np.outer(units, units), rcond=1e-6, hermitian=True) / np.outer(units, units)
         slopes = differences.average()
@@ -279,8 +265,8 @@ class _Fit:
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         rounding = 1e-6 * np.abs(numbers.point[:n])
         beyond = (changes @ along - step)[:n]
-        beyond = np.where(np.abs(beyond) > _ERRORS * np.hypot(error, own) + rounding, beyond, 0.0)
-        flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
+        beyond = np.where(np.abs(beyond) > ERRORS * np.hypot(error, own) + rounding, beyond, 0.0)
+        flat = squares + ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
@@ -323,12 +309,12 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    own = np.where(blind, np.inf, fit.own)
-    of_step = np.maximum(error, own)  # references without noise leave the noise of this check
+    of_step = np.maximum(error, own := np.where(blind, np.inf, fit.own))  # exact references leave this check's noise
     far = np.abs(fit.step) > (least := np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes))
     outside = (np.abs(fit.beyond) > least) & ~far  # a step from far away may be too long
     further = far & ~outside.any()  # more steps lead no further than the bound
-    shown, more = np.minimum(error, sizes), " or more" * bool((error > sizes).any())  # not linear beside an open number
+    larger = of_step > sizes  # not linear beside an open number
+    shown, more = np.minimum(of_step, sizes), " or more" * bool(larger.any())
     # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
     moved = np.abs(numbers.tangents()[:n, :n] @ (numbers.point[:n] - numbers.start))
     refuted = (moved > _FAR * of_step) & (fit.better < _BETTER)
@@ -348,7 +334,7 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
             others += [*numbers.fields] * bool(shared[of].any())
             together_with = f", together with {listed(others)}" if others else ""
-            limit = f"determines it to ± {_numbers(shown[of])}{more}" if (error <= sizes)[of].any() else ""
+            limit = "" if larger[of].all() else f"determines it to ± {_numbers(shown[of])}{more}"
             undetermined[key] = (
                 f"{key}: a least-squares test at the end {limit or 'does not determine it'}{together_with} (with the noise of the "
                 "references and of the test); fix one of these, add views or samples, or narrow the bounds"

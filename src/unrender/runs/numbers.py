@@ -23,6 +23,8 @@ _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
 _PATHS, _LEAST_PATHS, _SPP = 1 << 18, 1 << 11, (4, 32)
 """Path budget of the pictures of one pass, least paths of one picture in a short run, and limits of their samples per pixel."""
+ERRORS, _ROUNDING = 3.0, 1e-10
+"""Standard errors by which a change must exceed its noise; square of one, relative to the largest, that rounding leaves."""
 TOO_SHORT = "the run is too short for this test; use more steps or seconds, or fewer pixels"
 """Reason of a test that takes more than its share of the run's time."""
 
@@ -52,6 +54,11 @@ class Differences:
         variances = np.square((mean * apart).sum(axis=2))
         return (self.one * self.other).sum(axis=(1, 2)), np.sqrt(variances.sum(axis=1))
 
+    def hidden(self) -> np.ndarray:
+        """Return whether the change along a direction is within its noise, (K,)."""
+        squares, errors = self.squares()
+        return squares <= ERRORS * errors + _ROUNDING * float(np.abs(squares).max())
+
     def average(self) -> np.ndarray:
         """Return the mean of both halves, (K, P, 3)."""
         return 0.5 * (self.one + self.other)
@@ -65,6 +72,11 @@ class Differences:
         """Return the inverse squares of the standard errors of `squares`, (K,)."""
         squares, errors = self.squares()
         return 1.0 / np.square(errors + 1e-6 * np.abs(squares) + 1e-100)
+
+    def mixed(self, factors: np.ndarray) -> Differences:
+        """Return the differences along sums of the directions times factors (K, L), as far as pictures are linear."""
+        parts = (np.tensordot(factors.T, half, axes=1) for half in (self.one, self.other))
+        return Differences(self.directions @ factors, *parts)
 
     def moved(self, other: Differences, share: np.ndarray) -> Differences:
         """Return these differences, moved by shares (K,) towards others along the same directions."""
