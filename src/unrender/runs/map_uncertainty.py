@@ -214,7 +214,10 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
     if not square.any():
         return "no picture depends on it"
     if info.curved:
-        return "pictures may not change in proportion to it"
+        return (
+            "pictures may not change in proportion to it, and differ little before it has converged; compare it with that of a run of more "
+            "steps"
+        )
     if known.probes < FEWEST_PROBES:
         return TOO_SHORT
     if math.isnan(overlap := known.overlap.get(key, math.inf)):
