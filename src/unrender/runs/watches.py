@@ -31,7 +31,8 @@ class BoundsWatch(Callback):
     """Callback that warns of numbers that started inside of a bounded range and end next to one of its bounds.
 
     A derivative may vanish there or be mostly noise, so an optimisation that overshot does not return. Elements of colours, textures and
-    grids may well be at the ends of the physical range, so they count at other bounds only.
+    grids may well be at the ends of the physical range, so they count at other bounds only, and at the least roughness: the range ends
+    there so that paths have densities.
     """
 
     def warnings(self, run: Run) -> list[str]:
@@ -44,7 +45,8 @@ class BoundsWatch(Callback):
             near = _NEAR * (high - low)
             for bound, physical in ((low, known[key].lowest), (high, known[key].highest)):
                 count = int(np.sum((np.abs(last - bound) <= near) & (near < np.abs(first - bound))))
-                if count < (1.0 if first.size == 1 else _SHARE * first.size) or (first.size > 1 and bound == physical):
+                usual = first.size > 1 and bound == physical and not (bound == low and low > 0.0)
+                if usual or count < (1.0 if first.size == 1 else _SHARE * first.size):
                     continue
                 ended = f"ended at {last.item():.3g}," if first.size == 1 else f"{count} of {first.size} values ended"
                 wider = "" if bound == physical else "wider bounds, "
