@@ -22,6 +22,7 @@ from unrender.runs.progress import Progress
 
 SIZE, TEXELS = 16, 8
 NORMALS, COLOUR = "wall.bsdf.normalmap.data", "wall.bsdf.nested_bsdf.reflectance.data"
+BUMPS = "wall.bsdf.nested_texture.data"
 LAMPS = ([1.5, 1.0, 2.0], [-1.5, 1.0, 2.0], [0.0, -1.5, 2.0])
 
 
@@ -102,10 +103,17 @@ def test_textures_of_shapes_whose_ids_have_dots_are_of_one_surface_each(tmp_path
     assert line.startswith(f"whether changes of {listed(both)} hide")
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_a_standard_error_holds_if_other_textures_of_the_surface_are_right(shared: bool):
+@pytest.mark.parametrize("beside", [(), ("normalmap",), ("bumpmap",)])
+def test_a_standard_error_holds_if_other_textures_of_the_surface_are_right(beside: tuple[str, ...]):
     """A colour beside a bump map was .042 from the truth; its standard error was .006, "right to a factor of 1.7"."""
-    made, text = problem((NORMALS, COLOUR) if shared else (COLOUR,), WHITE[:1], False), io.StringIO()
+    described, text = scene(*WHITE[:1]), io.StringIO()
+    if bumps := "bumpmap" in beside:
+        heights = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((TEXELS, TEXELS, 1), 0.5, np.float32)), "raw": True}
+        described["wall"]["bsdf"] = {**described["wall"]["bsdf"], "type": "bumpmap", "arbitrary": heights}
+        described["wall"]["bsdf"].pop("normalmap")
+    keys = [*([BUMPS if bumps else NORMALS] * bool(beside)), COLOUR]
+    view = ur.View(np.full((SIZE, SIZE, 3), 0.3, np.float32))
+    made = ur.Problem(described, [ur.Parameter(key) for key in keys], [view], max_depth=2)
     values = made.initial_values()
     error, share = ({COLOUR: np.full_like(values[COLOUR], x)} for x in (0.01, 1.0))
     result = ur.Result(values, values, [], 1.0, 0.0, "steps", standard_error=error, data_share=share)
@@ -113,7 +121,7 @@ def test_a_standard_error_holds_if_other_textures_of_the_surface_are_right(share
         summarise(Console(file=text, width=200), made, result, progress)
     said = " ".join(text.getvalue().split())
     assert "0.01 (median standard error, right to a factor of 1.7" in said
-    assert ("1.7 if the other textures of its surface are right, where" in said) is shared
+    assert ("1.7 if the other textures of its surface are right, where" in said) is bool(beside)
 
 
 def test_a_run_that_is_too_short_for_the_test_says_so():
