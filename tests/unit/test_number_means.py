@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +34,13 @@ def run(seed: int = 0, steps: int = 200, **options: Any) -> ur.Result:
     return ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.02, beta_1=0.5), steps=steps, seed=seed, **options)
 
 
+@pytest.fixture
+def stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the errors of means, which only runs with a run folder test and report."""
+    monkeypatch.setattr("unrender.runs.optimize._with_reasons", lambda run, result: result)
+
+
+@pytest.mark.usefixtures("stated")
 def test_means_are_nearer_to_the_truth_than_the_last_values() -> None:
     results = [run(seed) for seed in SEEDS]
     assert all("numbers are means of their last steps" in line for result in results for line in result.adapted)
@@ -65,7 +73,11 @@ def test_a_run_without_a_folder_says_how_numbers_get_standard_errors(tmp_path: P
     assert line in html(result)
     known = uncertainty(problem(), result)
     assert known.standard_error.keys() | {line.partition(":")[0] for line in known.missing} >= {"gain"}
-    (line,) = _with_reasons(replace(result, misfit=cast(Any, "differs"))).without_errors
+    several = [run(seed) for seed in range(4)]  # means whose errors lack directions that no gradient moves
+    assert any("means of their last steps" in line for each in several for line in each.adapted)
+    assert not any(each.standard_error for each in several)
+    of: Any = SimpleNamespace(problem=problem(), optimizer=Adam(), state=SimpleNamespace(optimizer=None))
+    (line,) = _with_reasons(of, replace(result, misfit=cast(Any, "differs"))).without_errors
     assert line == "gain: no standard errors: the final picture differs from the references by more than noise"
     kept = ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.02), steps=3, run_directory=tmp_path / "run")
     assert not any("uncertainty(" in line for line in kept.without_errors)
@@ -86,6 +98,7 @@ def test_a_number_that_drifts_leaves_the_others_without_errors() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("stated")
 def test_numbers_beside_other_unknowns_have_means_without_errors() -> None:
     """A texture that still drifts takes numbers along slowly, so the scatter of their steps is no error."""
     made = problem()
@@ -105,6 +118,7 @@ def test_numbers_beside_other_unknowns_have_means_without_errors() -> None:
 
 @pytest.mark.slow
 @pytest.mark.mitsuba
+@pytest.mark.usefixtures("stated")
 def test_short_means_beside_control_variates_have_no_standard_errors() -> None:
     """Their noise is that of a few memories: a roughness of 0.2080 ± 0.0020 was 0.2."""
 

@@ -28,7 +28,7 @@ from unrender.runs.folder.writer import RunWriter
 from unrender.runs.loop import descend, prepare
 from unrender.runs.metadata import RunAnnotations, describe, describe_run, fingerprint_of, first_values
 from unrender.runs.notebook import NotebookProgress
-from unrender.runs.number_means import NumberMeans
+from unrender.runs.number_means import NumberMeans, numbers_of
 from unrender.runs.refinement import MeshRefinement, OtherStart, Refinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, raise_termination, to_numpy
@@ -100,7 +100,7 @@ def optimize(
     run.description, run.initial = describe_run(run, annotations), first_values(run)
     folder = _folder(run, annotations, run_directory, checkpoint_every)
     with _progress(progress) as bar, folder as writers, connected(run, [*bar, *callbacks], writers, annotations.phases):
-        return descend(run) if writers else _with_reasons(descend(run))
+        return descend(run) if writers else _with_reasons(run, descend(run))
 
 
 def _check_kinds(problem: Any, callbacks: Any, annotations: Any, progress: Any) -> None:
@@ -112,8 +112,13 @@ def _check_kinds(problem: Any, callbacks: Any, annotations: Any, progress: Any) 
         checks.flag("optimize", "progress", progress)
 
 
-def _with_reasons(result: Result) -> Result:
-    """Add a line for each unknown without standard errors to the result of a run without a run folder."""
+def _with_reasons(run: Run, result: Result) -> Result:
+    """Add a line for each unknown without standard errors to the result of a run without a run folder.
+
+    Nothing has tested the errors of means over steps: they lack the references' noise, and directions in which no gradient moves them.
+    """
+    untested = numbers_of(run.problem, run.optimizer, run.state.optimizer)
+    result = replace(result, standard_error={key: x for key, x in result.standard_error.items() if key not in untested})
     why = "unrender.runs.uncertainty(problem, result) computes them, or says why not, as a run with a run folder does"
     if result.misfit is not None:
         why = "the final picture differs from the references by more than noise"

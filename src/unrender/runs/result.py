@@ -58,10 +58,10 @@ class Result:
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings
             and of the references, infinite where the images do not determine it, or call for one beyond a bound. Runs with a run folder
             have it for up to 24 elements of numbers, also if textures and grids are unknown. There is none if the test cannot change
-            another unknown, or has no time; a line of `undetermined` says so. Other runs have it if all unknowns are numbers: for those
-            optimised by `AveragedNewton`, and for means over enough steps, without the references' noise; for the rest call
-            `unrender.runs.uncertainty`. Few numbers have none where the final picture differs from the references by more than noise; a
-            warning says so. Textures of runs with a run folder have a map, see `unrender.runs.uncertainty`.
+            another unknown, or has no time; a line of `undetermined` says so. Other runs have it if all unknowns are numbers that
+            `AveragedNewton` optimises; for the rest call `unrender.runs.uncertainty`. Few numbers have none where the final picture
+            differs from the references by more than noise; a warning says so. Textures of runs with a run folder have a map, see
+            `unrender.runs.uncertainty`.
         data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
         without_errors: one line for each texture or grid without a map of standard errors: the reason. Without a run folder, one for each
