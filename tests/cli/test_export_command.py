@@ -112,6 +112,10 @@ def _python(folder: Path) -> None:
     (folder / "result" / "problem.toml").write_text('name = "made in Python"\n')
 
 
+def _function(folder: Path) -> None:
+    (folder / "result" / "problem.toml").write_text('scene = "wall.xml"\nloss = "__main__.mine"\n')
+
+
 @pytest.mark.parametrize(
     ("spoil", "words", "message"),
     [
@@ -122,6 +126,7 @@ def _python(folder: Path) -> None:
         (_remove("wall.xml"), ["result"], "wall.xml"),
         (_shape, ["result"], f"parameter {KEY}: expected shape (3,), got (2, 2)"),
         (_python, ["result"], "the problem was made in Python; pass it"),
+        (_function, ["result"], "the problem was made in Python; pass it"),
         (None, ["result", "--out", "photo.exr"], "photo.exr: a file, expected a folder"),
         (None, ["result", "--out", "result"], "holds other things"),
         (None, ["result", "--out", "photo.exr/home"], "photo.exr"),

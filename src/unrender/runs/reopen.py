@@ -110,7 +110,8 @@ def problem_of(directory: str | Path) -> Problem:
         if not isinstance(name, str) or not isinstance(options, dict) or set(stored) - {"gallery", "options"}:
             raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(stored)[:80]}')
         return gallery.problem(name, **options)
-    if "scene" not in stored:
+    loss = stored.get("loss")
+    if "scene" not in stored or (isinstance(loss, str) and "." in loss.partition("(")[0]):  # such as __main__.function
         raise InputError(
             f"{path}: the problem was made in Python; pass it, as unrender.resume(folder, problem) or "
             "unrender.app.export((problem, result.parameters), out)"
