@@ -234,6 +234,28 @@ def test_poses_on_plateaus_are_found(name: str) -> None:
     assert max(errors.values()) < 0.003, errors
 
 
+@pytest.mark.slow
+def test_a_glass_ball_among_noisy_caustics_takes_gauss_newton_steps() -> None:
+    """Narrow differences of few samples explained none of the residual. A smoothed loss then moved the ball below the floor."""
+    lamp = mi.ScalarTransform4f().look_at([1.5, 2.5, 2.5], [0, 0, 0], [0, 1, 0]).scale(0.7)
+    made = {
+        "type": "scene",
+        "cam": camera("perspective", [0, 1.5, 4.5]),
+        "floor": floor(checkers(6), -1.0, 3),
+        "sky": {"type": "constant", "radiance": rgb(0.5)},
+        "lamp": {"type": "rectangle", "to_world": lamp, "emitter": {"type": "area", "radiance": rgb(10.0)}},
+        "ball": {"type": "sphere", "center": [0.5, -0.2, 0.3], "radius": 0.5, "bsdf": {"type": "dielectric"}},
+    }
+    integrator = mi.load_dict({"type": "path", "max_depth": 6})
+    reference = np.array(mi.render(mi.load_dict(made), integrator=integrator, spp=2048))
+    made["ball"]["center"] = [0.0, -0.2, 0.0]
+    unknown = [ur.Parameter("ball.translation", initial=np.zeros(3))]
+    problem = ur.Problem(made, unknown, [ur.View(reference)], max_depth=6)
+    result = ur.optimize(problem, steps=40, progress=False)
+    assert "Gauss-Newton steps" in result.choices[0]
+    assert np.linalg.norm(result.parameters["ball.translation"] - [0.5, 0.0, 0.3]) < 0.15
+
+
 def test_a_number_without_a_path_gradient_takes_gauss_newton_steps() -> None:
     """Sixty steps by a smoothed loss took the weight of a blendphase away from the truth."""
     phase = {"type": "blendphase", "weight": 0.5, "a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}

@@ -39,6 +39,9 @@ _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of the random numbers of `_explained`, and relative eigenvalue below which its matrix counts as singular or as noise."""
 
 
+_WIDER = 4  # factor of the samples of a second trial, whose pictures may have caustics
+
+
 def cameras(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if poses of sensors are unknown, with or without lenses; else None."""
     constants, problem = traits.constants, traits.problem
@@ -108,7 +111,15 @@ def few_numbers(traits: Traits) -> Plan | None:
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
     made = best_start(traits, keys, plan, plateau and shapes)
-    if plateau and (made is plan or (shapes and not _explained(made.configured().start(), problem, trial) > least)):
+    if plateau and shapes:
+        # Wide differences, with which steps begin, may reach where narrow ones do not.
+        paths = {"spp": _WIDER * trial.spp, "derivative_spp": _WIDER * trial.derivative_spp}
+        wide = replace(trial, coarse=estimator.coarse, **paths)
+        trials = ((trial, least), (wide, constants.explained_wide))
+        plateau = not any(_explained(made.configured().start(), problem, one) > share for one, share in trials)
+    elif plateau:
+        plateau = made is plan
+    if plateau:
         traits.notes.append(
             f"pictures at the start, and at other values, say little about {listed(traits.poses)}: the run may end far from them; give "
             "other initial values, or bounds"
