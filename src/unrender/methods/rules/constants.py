@@ -149,8 +149,8 @@ class Constants:
     Source: 0.22 to 0.34 for a block that overlaps, at most 0.003 on the plateaus of `box2`, `mug` and `shadow` (7c39b33).
     """
     explained_wide: float = 0.03
-    """The same fraction by wide differences, with which steps of shapes begin. Source: 0.08 to 0.12 for a glass ball half a unit away, near
-    which Gauss-Newton steps ended in 9 of 9 runs, a smoothed loss in none; at most 0.0004 on the plateaus of `box2`, `mug`, `shadow`."""
+    """The same fraction by wide differences, with which steps of shapes begin; below it a line says that the run may end far away. Source:
+    0.08 to 0.12 for a glass ball that these steps find; at most 0.0004 on the plateaus of `box2`, `mug` and `shadow`."""
     explained_light: float = 0.005
     """The same fraction if only lights move. Source: 0.016 for `stage-lights`, which converges; 0 for a light that misses the view."""
 

@@ -79,11 +79,10 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 def few_numbers(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if few numbers are unknown, and one is a light's or changes the form of the image; else None.
 
-    Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these
-    steps if derivative images at the start explain the residual, or if its picture is better than those around it; on a plateau a smoothed
-    loss is needed. Poses of lights may be combined with other numbers, such as intensities. A light on a plateau takes them too if a better
-    start is found elsewhere. So does any number without a path gradient, since a smoothed loss is far noisier. A shape on a plateau takes
-    them from the best of some places.
+    Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses of lights
+    may be combined with other numbers, such as intensities. They take a smoothed loss if derivative images at the start do not explain the
+    residual, its picture is no better than those around it, and no better start is found. A shape on such a plateau takes these steps from
+    the best of some places. So does any number without a path gradient, since a smoothed loss is far noisier.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
@@ -124,8 +123,7 @@ def few_numbers(traits: Traits) -> Plan | None:
             f"pictures at the start, and at other values, say little about {listed(traits.poses)}: the run may end far from them; give "
             "other initial values, or bounds"
         )
-        return None
-    return made
+    return None if plateau and not shapes else made
 
 
 def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
