@@ -172,7 +172,7 @@ def test_a_shape_on_a_plateau_starts_at_the_best_of_some_places() -> None:
         plan = method("auto").plan(ur.Problem(scene, unknown, [ur.View(reference)]))
         chosen[name], lines[name] = type(plan.estimator).__name__, " ".join(plan.reasons)
         started[name] = float(np.ravel(plan.configured().start()["block.translation.x"])[0])
-    assert chosen == {"near": "GaussNewton", "far": "GaussNewton", "away": "SmoothedDerivatives"}
+    assert set(chosen.values()) == {"GaussNewton"}
     assert started == {"near": 0.25, "far": pytest.approx(0.0, abs=0.1), "away": 0.0}
     assert "starts at other values of block.translation.x, where the loss is" in lines["far"]
     assert "say little about block.translation.x: the run may end far" in lines["away"]

@@ -82,7 +82,8 @@ def few_numbers(traits: Traits) -> Plan | None:
     Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses of lights
     may be combined with other numbers, such as intensities. They take a smoothed loss if derivative images at the start do not explain the
     residual, its picture is no better than those around it, and no better start is found. A shape on such a plateau takes these steps from
-    the best of some places. So does any number without a path gradient, since a smoothed loss is far noisier.
+    the best of some places, if derivative images explain something there. So does any number without a path gradient, since a smoothed loss
+    is far noisier.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
@@ -123,7 +124,8 @@ def few_numbers(traits: Traits) -> Plan | None:
             f"pictures at the start, and at other values, say little about {listed(traits.poses)}: the run may end far from them; give "
             "other initial values, or bounds"
         )
-    return None if plateau and not shapes else made
+        return plan if shapes else None
+    return made
 
 
 def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
