@@ -229,16 +229,16 @@ def directions(hessian: np.ndarray | None, widths: np.ndarray, largest: np.ndarr
     if hessian is None or not np.isfinite(hessian).all():
         return rows
     changes = widths[:, None] * hessian * widths
-    units = np.sqrt(np.maximum(np.diag(changes), 0.0))
-    if not units.all():
+    if not (np.diag(changes) > 0.0).all():
         return rows
-    values, vectors = np.linalg.eigh(changes / np.outer(units, units))
+    _, values, vectors = scores.scaled_eigh(changes)
     weak = np.flatnonzero(values < _WEAK)[:_MOST_WEAK]
     if not weak.size:
         return rows
     from scipy.linalg import qr
 
     replaced = qr(vectors[:, weak].T, mode="r", pivoting=True)[-1][: weak.size]
+    units = np.sqrt(np.diag(changes))
     moves = (vectors[:, weak] / units[:, None]).T * units.mean() * widths
     moves /= np.sqrt(np.maximum(values[weak], _LONGEST**-2))[:, None]
     rows[replaced] = moves / np.maximum(np.abs(moves / largest).max(axis=1, keepdims=True), 1.0)

@@ -96,8 +96,10 @@ class Point:
         known = problem.renderer.parameters()
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
         # No picture depends on the length of a direction, which says nothing of its own error.
-        other = (key for key, info in known.items() if info.scattering or info.role in ("direction", "ratios"))
-        edges = {key: info.rigid or info.nonlinear for key, info in known.items()} | dict.fromkeys(other, False)
+        edges = {
+            key: (info.rigid or info.nonlinear) and not info.scattering and info.role not in ("direction", "ratios")
+            for key, info in known.items()
+        }
         self._edges = trees.repeat_per_element(edges, parameters) > 0.0
         self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 

@@ -258,9 +258,8 @@ class _Surface:
         for key in self.keys:
             own = [n for n, (name, _) in enumerate(fields) if name == key]
             before, squares = np.asarray(self.values[key], np.float64), np.square(amounts[:, own])
-            axes = (
-                (0, 1) if self._is_normal(key) else 0
-            )  # turns have no channels of their own, so both have the mean size
+            # Turns of normals have no channels of their own, so both have the mean size.
+            axes = (0, 1) if self._is_normal(key) else 0
             step = sum(amounts[self._cells.of[key], n, None] * fields[n][1] for n in own)
             moved = self.problem.unknowns[key].project(before + np.reshape(step, before.shape))
             after[key] = np.asarray(moved, np.float32)

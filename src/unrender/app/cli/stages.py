@@ -192,9 +192,8 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
             doubtful |= status in schema.DOUBTFUL
         else:
             seconds = None if (folder / schema.RECORD).is_file() else stages_file.split(run.stages)[index][1]
-            progress.budget_began = now = time.perf_counter()
-            if seconds is not None:
-                progress.budget_began = min(due, now)
+            now = time.perf_counter()
+            progress.budget_began = now if seconds is None else min(due, now)
             due = progress.budget_began + (seconds or 0.0)
             problem, result = _run_stage(run, index, values, console, progress)
             last = index == len(run.stages.stages) - 1

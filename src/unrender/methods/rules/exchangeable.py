@@ -16,7 +16,7 @@ from unrender.scene.problem import Problem
 _MOTIONS = ("translation", "rotation", "scale")
 """Parts of the keys of poses, after the name of what they move."""
 _WEIGHT, _CHILDREN = ".weight.", ("bsdf", "phase")
-"""What is in the keys of a blend's weight, and beginnings of the names of its children."""
+"""Part of the key of a blend's weight; prefixes of the names of its children, such as bsdf_0."""
 _POSITION = "position"  # last part of the keys of positions of lights without a pose
 _NORMALS, _TRANSFORM, _ROUNDING = "_normals", "to_", 1e-4
 """Last part of the keys of normals, and its beginning for transforms, which are not compared; largest difference of equal positions,
@@ -53,22 +53,21 @@ def exchangeable_children(problem: Problem) -> dict[tuple[str, str], str]:
 
     Exchanged, with 1 − w in place of w, they give the same picture, unless bounds keep w on one side of a half.
     """
-    infos, unknown, found = problem.renderer.parameters(), problem.shapes(), {}
-    for key in (key for key in unknown if _WEIGHT in key):
-        low, high = ends_of(problem.unknowns[key].bounds)
+    infos, unknown = problem.renderer.parameters(), problem.shapes()
+    found: dict[tuple[str, str], str] = {}
+    for weight in (key for key in unknown if _WEIGHT in key):
+        low, high = ends_of(problem.unknowns[weight].bounds)
+        if not low < 0.5 < high:
+            continue
         for child in _CHILDREN:
-            one, other = (f"{key.partition(_WEIGHT)[0]}.{child}_{index}" for index in (0, 1))
-            parts, others = ({k.removeprefix(x) for k in infos if k.startswith(f"{x}.")} for x in (one, other))
+            one, other = (f"{weight.partition(_WEIGHT)[0]}.{child}_{index}" for index in (0, 1))
+            parts, others = ({key.removeprefix(x) for key in infos if key.startswith(f"{x}.")} for x in (one, other))
+            if parts != others:
+                continue
             pairs = [(one + part, other + part) for part in parts]
-            both = {(k in unknown) + (twin in unknown) for k, twin in pairs}
-            if (
-                parts == others
-                and 2 in both
-                and 1 not in both
-                and low < 0.5 < high
-                and _interchangeable(problem, pairs)
-            ):
-                found[one, other] = key
+            unknowns = {sum(key in unknown for key in pair) for pair in pairs}
+            if 2 in unknowns and 1 not in unknowns and _interchangeable(problem, pairs):
+                found[one, other] = weight
     return found
 
 

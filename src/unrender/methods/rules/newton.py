@@ -37,8 +37,6 @@ from unrender.statistics.scores import positive_inverse
 
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of the random numbers of `_explained`, and relative eigenvalue below which its matrix counts as singular or as noise."""
-
-
 _WIDER = 4  # factor of the samples of a second trial, whose pictures may have caustics
 
 

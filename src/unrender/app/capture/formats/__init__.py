@@ -100,7 +100,8 @@ def _each_once(capture: Capture) -> Capture:
     if not (twice := len(capture.photographs) - len(unique)):
         return capture
     notice = f"{twice} of {len(capture.photographs)} photographs are listed again and were skipped"
-    photographs = tuple(each for each in capture.photographs if any(each is one for one in unique.values()))
+    kept = {id(each) for each in unique.values()}
+    photographs = tuple(each for each in capture.photographs if id(each) in kept)
     return replace(capture, photographs=photographs, notices=(*capture.notices, notice))
 
 
